@@ -1,4 +1,4 @@
-"""Selection of the runs that a grid asks for, as a sweep's folder may hold runs of older grids."""
+"""Select the runs that a grid requests, because a sweep's folder may also contain older runs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,8 @@ from crossgrad_plugins.sweep.summary import earlier_rows
 
 #: Values that a run decides at its start.
 _LEFT_OPEN: Final = ("auto", ABSENT)
-#: Paths, which a grid may name from its own folder, and settings that a run replaces.
+#: Settings that are not compared: paths, which may be relative to the folder of the grid, and a
+#: setting that a run replaces.
 _OTHERWISE: Final = ("exposure_from", "data.init", "plan")
 
 
@@ -54,7 +55,7 @@ class Asked:
         return cls(config, named, bool(LENGTHS & settings.keys()))
 
     def fits(self, run: Run) -> bool:
-        """Return whether a run has all named settings. Undecided or unknown settings fit."""
+        """Return True if a run uses all named settings. Undecided or unknown settings fit."""
         return (not self.has_length or self._fits_length(run)) and all(
             asked in {run.settings.get(name, asked), *_LEFT_OPEN}
             for name, asked in self.settings.items()
@@ -94,7 +95,7 @@ def of_earlier_grids(runs: Sequence[Run]) -> frozenset[Run]:
 
 
 def asked_for(runs: Sequence[Run], asked: Asked, earlier: frozenset[Run]) -> list[Run]:
-    """Return the runs that the grid asks for, from runs with one label, scene and seed.
+    """Return the runs that the grid requests, from runs with one label, scene and seed.
 
     Args:
         runs: The runs.
@@ -110,7 +111,7 @@ def asked_for(runs: Sequence[Run], asked: Asked, earlier: frozenset[Run]) -> lis
 
 
 def only(runs: Sequence[Run], label: str) -> Run:
-    """Return the first of runs with one label, scene and seed, if the other runs repeat it.
+    """Return the first of several runs with one label, scene and seed, which must be repetitions.
 
     Raises:
         UserError: The runs have different configurations.
@@ -122,9 +123,9 @@ def only(runs: Sequence[Run], label: str) -> Run:
                 f"{label or 'an arm'} has two configurations with seed {first.seed}"
                 f" on {first.scene}",
                 where=f"{first.results.folder}, {other.results.folder}",
-                expected="one: the folder of a sweep may hold runs of an earlier grid",
+                expected="one configuration; the folder may contain runs of an earlier grid",
                 found=difference,
-                todo="move the folder of the run away that is not meant",
+                todo="move the folder of the unwanted run away",
             )
     return first
 

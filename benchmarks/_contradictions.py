@@ -1,4 +1,4 @@
-"""Correct scenes in memory, and changes that make them contradict themselves."""
+"""Correct scenes in memory, and changes after which a scene contradicts itself."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from crossgrad_core.scene.frame import make_frame
 
 Floats: TypeAlias = NDArray[np.float64]
 Photo: TypeAlias = NDArray[np.uint8]
-#: One photo in this number of photos is held out.
+#: One photo out of this many photos is held out.
 EVERY: Final = 8
 _FLIP: Final = np.diag([1.0, -1.0, -1.0])
 
@@ -38,14 +38,14 @@ class MemoryPhoto:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A scene as a reader finds it, including its photos.
+    """A scene as a reader returns it, including its photos.
 
     Attributes:
         rotations: [V, 3, 3] world to camera.
         translations: [V, 3].
         calibrations: [V, 4] fx, fy, cx, cy.
         photos: [V] of [H, W, 3].
-        seen: [V] rows of points.
+        seen: [V] indices of the points that each view observes.
         points: [P, 3].
         colors: [P, 3] uint8.
     """
@@ -135,7 +135,7 @@ class Wrong:
         model: The model.
         strength: Strength of the contradiction, as a text for the table.
         views: The wrong views, or an empty set if all views are wrong.
-        causes: Words. The correct cause contains at least one of them.
+        causes: The correct cause contains at least one of these words.
     """
 
     model: Model
@@ -148,7 +148,7 @@ Kind: TypeAlias = Callable[[Model, np.random.Generator], Wrong]
 
 
 def some_views(model: Model, rng: np.random.Generator, most: float = 0.25) -> NDArray[np.int64]:
-    """Return a random selection of one view up to the share `most` of all views."""
+    """Return random views: at least one, and at most the share `most` of all views."""
     count = len(model.photos)
     return np.sort(rng.choice(count, rng.integers(1, max(2, int(most * count) + 1)), replace=False))
 
@@ -253,7 +253,7 @@ def shifted(model: Model, rng: np.random.Generator) -> Wrong:
 
 
 def half_elsewhere(model: Model, rng: np.random.Generator) -> Wrong:
-    """Assign half of the photos to each other's poses."""
+    """Exchange the poses of half of the photos among these photos."""
     views = rng.permutation(len(model.photos))[: len(model.photos) // 2]
     photos = list(model.photos)
     for a, b in zip(views, np.roll(views, 1), strict=True):

@@ -1,4 +1,4 @@
-"""Another capture of a place, and tables of figures on its views, with a record of their origin."""
+"""Evaluate runs on another capture of the same place, and store the figures with their origin."""
 
 import csv
 import json
@@ -58,7 +58,7 @@ class Table:
     Attributes:
         run: The run.
         capture: The capture.
-        file: True if the run's PLY is drawn on black, instead of its model.
+        file: True to draw the run's PLY on black, False to draw its model.
     """
 
     run: Run
@@ -73,7 +73,7 @@ class Table:
 
     @property
     def is_unmarked(self) -> bool:
-        """True if the table has no record of its origin, as tables of `crossgrad eval`."""
+        """True if the table has no record of its origin, like tables of `crossgrad eval`."""
         return self._origin() is None
 
     def figures(self, name: str) -> dict[str, float]:
@@ -103,7 +103,7 @@ class Table:
         return not self._has_checkpoint() and all(row["name"] in views for row in self._rows())
 
     def _origin(self) -> Origin | None:
-        """Return the table's origin, or None if it is unknown or belongs to other content."""
+        """Return the table's origin, or None if its record is missing or outdated."""
         path = self.path.with_suffix(".json")
         if not path.is_file():
             return None
@@ -126,11 +126,11 @@ class Table:
         folder, on = self.run.results.folder, self.capture.path
         if self.path.is_file() and not self._has_checkpoint():
             raise UserError(
-                "the figures of a run are of other views, or of another state of the run",
+                "the figures of a run belong to other views, or to another state of the run",
                 where=self.path,
-                expected=f"those of {on} at step {self.run.number('step'):,.0f}",
+                expected=f"figures on {on} at step {self.run.number('step'):,.0f}",
                 found="a run without checkpoints, which cannot be evaluated again",
-                todo="name the scene that the table is of with --on, or leave out the run's arm",
+                todo="name the scene of the table with --on, or leave out the run's arm",
             )
         print(folder, file=sys.stderr, flush=True)
         how = How(threads=1)

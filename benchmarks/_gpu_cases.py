@@ -7,7 +7,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-#: The last one is the reference in plain torch, which takes part only for K = 1.
+#: The last rasterizer is the reference in plain torch. It is measured only for K = 1.
 RASTERIZERS = ("gsplat", "gswarp", "torch")
 BACKBONES = ("vanilla", "pixel", "mip", "distance", "scaffold", "octree")
 VIEWS = (1, 2, 4, 8)
@@ -16,7 +16,7 @@ OPERATORS = ("sum", "mean", "pcgrad", "cagrad", "upgrad", "symmetric")
 SIZES, PIXELS = (100_000, 1_000_000, 3_000_000), 1.0
 #: Lengths of runs with the default settings of `crossgrad run`.
 USUAL = (1_000, 7_000, 30_000)
-#: Steps of a long run that have a row, in addition to the last step.
+#: Steps of a long run that get a row in the table, in addition to the last step.
 STOPS = (7_000, 15_000)
 
 
@@ -59,7 +59,7 @@ class Case:
             "--steps": self.steps,
             "--metrics": "psnr",
             "--out": out,
-            "--split": "every",  # As in gsplat's trainer, for photos in one folder.
+            "--split": "every",  # As gsplat does, if the photos are in one folder.
             "--eval-every": max(1, min(1_000, self.steps // 7)),
         }
         if self.part == "long":
@@ -101,7 +101,7 @@ def cases(steps: int, long: int) -> Iterator[Case]:
 
 
 def is_chosen(case: Case, only: Sequence[str] | None) -> bool:
-    """Return whether the name of a case contains one of the texts, or no texts are given."""
+    """Return True if a case's name contains one of the texts, or if no texts are given."""
     return not only or any(text in case.name for text in only)
 
 

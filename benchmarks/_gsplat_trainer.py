@@ -32,7 +32,7 @@ class Stop:
 def trained(
     examples: Path, scene: Path, runs: Path, stops: Sequence[int], limit: float | None
 ) -> tuple[list[Stop], str]:
-    """Train up to the last stop if it is missing. Return the reached stops and a failure text.
+    """Train to the last stop, unless its figures exist. Return the reached stops and a failure.
 
     Args:
         examples: The folder of gsplat's examples.
@@ -50,7 +50,7 @@ def trained(
         why = _failure(list(map(str, command)), examples, limit)
     reached = [_stop(folder, step) for step in stops if _told(folder, step).is_file()]
     if not why and len(reached) < len(stops):
-        why = f"it wrote no figures after {stops[-1]} steps"
+        why = f"gsplat's trainer wrote no figures after {stops[-1]} steps"
     return reached, why
 
 

@@ -43,7 +43,7 @@ class Reading(_Part):
 
     Attributes:
         column: Column of the table.
-        block: Block of the gradients. `each` averages over single blocks, too.
+        block: Block of the gradients. `each` also averages over single blocks.
         metric: Metric in which gradients are measured.
     """
 
@@ -99,10 +99,10 @@ class Check(_Part):
         test: Two arms.
         probe: A figure of the gradients.
         arithmetic: The paper's own figures.
-        none: Reason why nothing tests the statement.
+        none: Reason why the statement is not tested.
         expected: The statement about `test`, or about the sign of `probe`.
         within: The bounds for the value of `probe` in the statement.
-        margin: Largest difference that counts as none, or None for 0.1 dB.
+        margin: Largest difference that counts as equal, or None for 0.1 dB.
     """
 
     test: Pairing | None = None
@@ -153,9 +153,9 @@ class Row(_Part):
         first: The arm that represents the row.
         second: The arm that represents the reference, only used with `first`.
         probe: A figure of the gradients that is used instead.
-        none: Reason why nothing tests the row.
+        none: Reason why the row is not tested.
         expected: The row's statement about the sign of `probe`.
-        margin: Largest difference of `probe` that counts as none.
+        margin: Largest difference of `probe` that counts as equal.
     """
 
     first: str | None = None

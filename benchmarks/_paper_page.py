@@ -16,7 +16,7 @@ from crossgrad_plugins.compare.run import Run
 
 #: Arms whose runs contain probes of the gradients.
 WATCHED = ("one view, 2x stretched", "symmetric")
-#: What is equal in a comparison of two views with one view -> the two arms.
+#: Equal quantity of a comparison -> the arm with two views and the arm with one view.
 EQUAL = {
     "equal steps": ("two random views", "one view, 1x"),
     "equal views": ("two random views", "one view, 2x stretched"),
@@ -26,7 +26,7 @@ EQUAL = {
         "one view, 2x stretched, published rates",
     ),
 }
-#: Differences of the paper below this value, in dB, count as none.
+#: Differences in the paper below this value, in dB, count as equal.
 _SAME = 0.1
 _HEAD = "| {} | the paper | command | ours | verdict |"
 
@@ -51,10 +51,10 @@ def page(claims: Claims, results: Results, tables: Tables, extra: Sequence[str] 
     )
     lines = [
         *_opening(claims, results, outcomes),
-        "## Its tables",
+        "## Tables of the paper",
         "",
         *(line for text, _ in blocks for line in text),
-        "## Its claims, and what it did not ask",
+        "## Claims of the paper, and further questions",
         "",
         *(line for title, (text, _) in sections for line in (f"### {title}", "", *text, "")),
         *_second_view(results),
@@ -72,29 +72,46 @@ def _opening(claims: Claims, results: Results, outcomes: Mapping[Outcome, int]) 
     yield from (
         "# The paper, row by row",
         "",
-        f"Tables and claims of {claims.source}, tested on our scenes. `make paper` runs what is "
-        "missing and writes this page; do not edit it.",
+        f"This page tests each table row and each claim of {claims.source} on our scenes. `make "
+        "paper` trains the missing runs and writes this page. Do not edit it.",
         "",
-        f"**{finished:,} of {planned:,} runs have finished.** "
-        + (" ".join(f"{outcomes.get(each, 0)} {each.value}," for each in Outcome).rstrip(","))
+        f"**{finished:,} of {planned:,} runs have finished.** Verdicts: "
+        + ", ".join(f"{each.value} {outcomes.get(each, 0)}" for each in Outcome)
         + ".",
         "",
-        "Ours are differences of PSNR in dB after colour correction (`psnr_cc`, "
-        "[metrics](../metrics.md)), first arm minus second: estimate with its 95 % interval over n "
-        "pairs of runs on one scene with one seed, by the statistics of "
-        "[`crossgrad compare`](../compare.md). `plain` is the estimate for plain PSNR, which on "
-        "scenes of uneven exposure is mostly the guess at the exposure of held-out photos, so that "
-        "arms look alike in it. The margin is 0.1 dB. A statement of equality holds where the 90 % "
-        "interval lies within the margin, one of order where the 95 % interval excludes zero; "
-        "p-values of a table with more than five are corrected together. The interquartile mean of "
-        "12 pairs leaves out a scene that is unlike the others: where the 95 % interval of a scene "
-        "by itself contradicts what all together say, it is named and the claim does not hold. "
-        "Every arm has its own "
-        "best factor of the learning rates, found on a seed that is not counted, or that of an arm "
-        "with as many views per step (`benchmarks/paper_data/plan.yaml`).",
+        "## How to read the tables",
+        "",
+        "- Our figures are differences in PSNR after colour correction (`psnr_cc`, "
+        "[metrics](../metrics.md)), in dB: the first arm minus the second arm.",
+        "- Each difference has its 95 % interval and its number of pairs n. A pair is two runs on "
+        "one scene with one seed. The statistics are the same as in "
+        "[`crossgrad compare`](../compare.md).",
+        "- `plain` is the difference in plain PSNR. If the exposure of a scene is uneven, plain "
+        "PSNR mostly depends on the guessed exposure of held-out photos. Different arms "
+        "then have a similar plain PSNR.",
+        "- A claim that two arms are equal holds if the 90 % interval lies within the margin of "
+        "0.1 dB.",
+        "- A claim that one arm is better holds if the 95 % interval excludes zero.",
+        "- In a table with more than five comparisons, the p-values are corrected together.",
+        "- Each arm uses its own best factor of the learning rates. The factor was chosen on a "
+        "seed that does not count here. An arm without its own tuning uses the factor of an arm "
+        "with the same number of views per step (`benchmarks/paper_data/plan.yaml`).",
+        "",
+        "| remark in the verdict column | meaning |",
+        "|---|---|",
+        "| surely otherwise on SCENE | The 95 % interval of this scene alone contradicts the "
+        "pooled result, so the verdict is never `holds`. The interquartile mean of 12 pairs "
+        "ignores most of a scene that differs. |",
+        "| by less than the margin | The difference is certain, but smaller than the margin. |",
+        "| sure by itself, but not beside the other comparisons of its table | The interval "
+        "decides the claim, but not after the correction for all comparisons of the table. |",
+        "| n \u2265 N pairs needed to tell 0.1 dB at this noise | At least N pairs are "
+        "needed to detect a difference of 0.1 dB. |",
         "",
         *_machines(results),
-        "Recipes for those who have the data:",
+        "## Recipes for the paper's scenes",
+        "",
+        "Use these recipes if you have the scenes of the paper.",
         "",
         *(f"- {name}: {text}" for name, text in claims.recipes.items()),
         "",
@@ -137,7 +154,7 @@ def _table(
             lines.append(_row(method, text, _command(checks[method], results), answer))
     metrics = dict.fromkeys(each.metric for figures in methods.values() for each in figures)
     itself = Answer(Outcome.UNTESTABLE, "", claims.untestable)
-    text = f"the figures themselves ({', '.join(metrics)})"
+    text = f"the absolute figures ({', '.join(metrics)})"
     lines += [_row("all", text, "", itself), ""]
     return lines, found
 
@@ -152,7 +169,7 @@ def _section(
     section: Sequence[Check], results: Results, tables: Tables
 ) -> tuple[list[str], list[Answer]]:
     found = answers(section, results, tables)
-    lines = [_HEAD.format("where"), "|---" * 5 + "|"]
+    lines = [_HEAD.format("place in the paper"), "|---" * 5 + "|"]
     for each, answer in zip(section, found, strict=True):
         where, says = getattr(each, "where", ""), getattr(each, "says", "")
         lines.append(_row(where, says, _command(each, results), answer))
@@ -177,7 +194,7 @@ def _expected(tables: Tables, table: Table, method: str) -> Expected:
 
 
 def _differences(tables: Tables, table: Table, method: str) -> dict[str, float]:
-    """Return scene -> PSNR of a method minus the reference, or the figures of a table of gains."""
+    """Return scene -> PSNR minus the reference's PSNR. A table of gains gives its own figures."""
     gains = values(tables, table.id, method, "PSNR_gain")
     if gains or table.reference is None:
         return gains
@@ -207,10 +224,10 @@ def _figures(tables: Tables, table: str, method: str) -> str:
 def _second_view(results: Results) -> Iterator[str]:
     """Yield the gain of the second view on each scene, at equal steps, views and seconds."""
     yield from (
-        "## What the second view buys, scene by scene",
+        "## Gain of the second view by scene",
         "",
-        "The p-values of all rows are corrected together: an interval of three pairs that excludes "
-        "zero is one of so many.",
+        "The p-values of all rows are corrected together. With this many rows, an interval of "
+        "three pairs can exclude zero by chance.",
         "",
     )
     contrasts = {
@@ -258,7 +275,12 @@ def _scenes(results: Results) -> list[str]:
 
 
 def _other_backbones(results: Results, extra: Sequence[str]) -> Iterator[str]:
-    yield from ("## Other backbones", "", "The two methods that ended best on vanilla.", "")
+    yield from (
+        "## Other backbones",
+        "",
+        "Each backbone is trained with the two methods that were best on vanilla.",
+        "",
+    )
     table = standings({arm: results.runs.get(arm, {}) for arm in extra}, PSNR)
     if not any(table.values()):
         yield from ("not run", "")
@@ -289,9 +311,13 @@ def _by_scene(results: Results) -> Iterator[str]:
         yield from ("not run", "")
         return
     yield from (
-        "Sarle's coefficient in the finite-sample form and that of plain moments (0.555 is that of "
-        "a uniform sample, and the former grows with the number of views); means over the probes "
-        "and seeds of one view per step, `all` blocks.",
+        "- Bimodality is Sarle's coefficient. The first number is its finite-sample form, which "
+        "grows with the number of views. The second number uses plain moments. A uniform sample "
+        "has 0.555.",
+        "- Var(r)/mean(r)^2 is the relative variance of the cameras' distances: radial distance, "
+        "then depth.",
+        "- The conflict rate and sigma_b^2/sigma_w^2 use the gradients of all blocks together. "
+        "They and the exponent are means over probes and seeds of runs with one view per step.",
         "",
         "| scene | quantity: bimodality | Var(r)/mean(r)^2 | conflict rate | sigma_b^2/sigma_w^2 "
         "| exponent of positions | projection minus random pairs |",
@@ -343,13 +369,18 @@ def _trajectories(results: Results) -> Iterator[str]:
         yield from ("not run", "")
         return
     yield from (
-        "Probes at frozen parameters; the mean over seeds, except that variances and their 95 % "
-        "intervals are those of the first seed, the probed views taken as a sample. Conflict is "
-        "that of all blocks as one vector and, in brackets, averaged over blocks. A negative "
-        "sigma_b^2 is an estimate that cannot be told from 0.",
+        "Each row is one probe. A probe measures gradients at frozen parameters.",
+        "",
+        "- Conflict rates and ratios are means over seeds.",
+        "- Variances and their 95 % intervals are from the first seed. The intervals treat the "
+        "probed views as a sample.",
+        "- The first conflict rate joins all blocks into one vector. The rate in brackets is the "
+        "mean over single blocks.",
+        "- A negative sigma_b^2 is an estimate that does not clearly differ from 0.",
         "",
         "| arm | scene | step | conflict rate | ratio of positions | ratio of opacity + DC "
-        "| sigma_w^2 | sigma_b^2 | sigma_b^2/sigma_w^2 | the same, Adam's metric |",
+        "| sigma_w^2 | sigma_b^2 | sigma_b^2/sigma_w^2 "
+        "| sigma_b^2/sigma_w^2, Adam's metric |",
         "|---" * 10 + "|",
         *rows,
         "",
@@ -394,7 +425,12 @@ def _with_interval(row: Mapping[str, str], column: str) -> str:
 
 
 def _noise(results: Results) -> Iterator[str]:
-    yield from ("## Noise", "", "Standard deviation of a run over seeds, pooled over all arms.", "")
+    yield from (
+        "## Noise",
+        "",
+        "Standard deviation of `psnr_cc` over seeds, pooled over all arms.",
+        "",
+    )
     found = noise(standings(results.runs, PSNR), results.runs)
     if not found:
         yield "not run"

@@ -30,7 +30,7 @@ class Results:
         planned: Arm -> scenes and seeds in its grid.
         failed: Arm -> scenes and seeds whose run failed.
         grids: Arm -> its grid.
-        left_out: Arm -> folders of its runs that the grid does not ask for.
+        left_out: Arm -> folders of its runs that the grid does not request.
     """
 
     runs: Mapping[str, Runs]
@@ -102,7 +102,7 @@ def _chosen(
     dict[str, frozenset[tuple[str, int]]],
     dict[str, tuple[Path, ...]],
 ]:
-    """Return by arm the runs that its grid asks for, the failed runs, and the other runs."""
+    """Return for each arm the requested runs, the failed runs, and the other runs."""
     runs: dict[str, dict[tuple[str, int], Run]] = {}
     failed: dict[str, frozenset[tuple[str, int]]] = {}
     left_out: dict[str, tuple[Path, ...]] = {}

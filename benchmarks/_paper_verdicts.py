@@ -17,7 +17,7 @@ from crossgrad_plugins.compare.statistics import Estimate, Verdict, corrected, e
 #: Largest significant p-value, and the share of lost pairs that leaves a claim open.
 _SURE, _LOST = 0.05, 0.25
 #: The figure of the verdicts. If the exposure of held-out photos is guessed wrongly, plain PSNR
-#: depends more on this guess than on the scene, so that different arms look alike.
+#: depends more on this guess than on the scene. Different arms then have similar values.
 PSNR = Quantity.of("psnr_cc")
 PLAIN = Quantity.of("psnr")
 
@@ -39,7 +39,7 @@ class Answer:
     Attributes:
         outcome: The verdict.
         figure: Our figure with its interval, or an empty text.
-        detail: Further remarks on the verdict, or an empty text.
+        detail: Remarks on the verdict, or an empty text.
     """
 
     outcome: Outcome
@@ -114,7 +114,7 @@ def _is_whole(each: _Measured) -> bool:
 
 def _estimate(each: _Measured) -> Estimate:
     if each.contrast is None or each.contrast.estimate is None:
-        raise ValueError("only what was measured is judged")
+        raise ValueError("a check without an estimate cannot be judged")
     return each.contrast.estimate
 
 
@@ -200,12 +200,12 @@ def _unjudged(each: _Measured, tables: Tables) -> Answer:
     if each.missing:
         detail = f"{ended} of {each.wanted} pairs so far" if ended else ""
         return Answer(Outcome.NOT_RUN, each.figure, detail)
-    return Answer(Outcome.OPEN, "", "all runs ended, and none of the pairs has the figure")
+    return Answer(Outcome.OPEN, "", "all runs have ended, but no pair has the figure")
 
 
 def _judged(each: _Measured, judgement: Judgement) -> Answer:
     if each.contrast is None or each.contrast.estimate is None:
-        raise ValueError("only what was measured is judged")
+        raise ValueError("a check without an estimate cannot be judged")
     found = replace(each.contrast, verdict=judgement.verdict)
     outcome = outcome_of(each.check.expected or "equal", judgement, found)
     lost = each.wanted - len(found.pairs)
@@ -224,7 +224,7 @@ def _judged(each: _Measured, judgement: Judgement) -> Answer:
 
 
 def _located(within: tuple[float, float], interval: tuple[float, float]) -> Outcome:
-    """Return whether a value is within bounds, judged by its 95 % interval."""
+    """Return the verdict on the claim that a value is within bounds, from its 95 % interval."""
     low, high = interval
     if within[0] <= low and high <= within[1]:
         return Outcome.HOLDS
@@ -234,7 +234,7 @@ def _located(within: tuple[float, float], interval: tuple[float, float]) -> Outc
 def outcome_of(expected: Expected, judgement: Judgement, found: Contrast) -> Outcome:
     """Return the outcome of a statement about two arms, from the judgement on their difference.
 
-    A statement that is true for all scenes together is open if a scene surely contradicts it.
+    A statement that holds for all scenes together is open if one scene clearly contradicts it.
     """
     ahead = found.favours == found.first
     verdict = judgement.verdict

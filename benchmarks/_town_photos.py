@@ -154,7 +154,7 @@ def _sky(way: Vector, k: int) -> Vector:
 
 @kernel
 def _hit_box(eye: Vector, way: Vector, box: Array, best: float) -> tuple[float, int]:
-    """Return distance and face axis of a box nearer than `best`, else `best` and -1."""
+    """Return distance and face axis of a box if it is nearer than `best`, else `best` and -1."""
     x, y, z = eye[0] - box[0], eye[1] - box[1], eye[2] - box[8]
     along = x * way[0] + y * way[1] + z * way[2]
     if along > box[9] or x * x + y * y + z * z - along * along > box[9] * box[9]:
@@ -195,7 +195,7 @@ def first_hit(
 
     Args:
         eye: Start of the ray.
-        way: Unit vector.
+        way: Direction of the ray, a unit vector.
         boxes: [B, 10].
         trees: [T, 5].
         any_hit: True if any hit is enough.

@@ -1,4 +1,4 @@
-"""Compares a fast rasterizer with the float64 reference on a fixed case, as one JSON line.
+"""Compare a fast rasterizer with the float64 reference on a fixed case, as one JSON line.
 
     python benchmarks/accuracy.py CASE.npz [--rasterizer numba]
 

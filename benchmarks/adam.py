@@ -1,4 +1,4 @@
-"""Median seconds of one Adam step on the tensors of vanilla 3DGS, as one JSON line.
+"""Print the median seconds of an Adam step on the tensors of vanilla 3DGS, as one JSON line.
 
     python benchmarks/adam.py [--gaussians N] [--reps N] [--threads N]
 

@@ -1,4 +1,4 @@
-"""Median milliseconds of a sparse Adam step: with the rows that are drawn, or with all rows.
+"""Time an Adam step of the drawn rows, compared with a step of all rows.
 
     python benchmarks/adam_rows.py [--rows N] [--reps N]
 
@@ -22,12 +22,12 @@ from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.training.adam import late
 from crossgrad_core.training.adam.adam import counted
 
-#: Rows that are drawn together, number of alternating choices of rows, and shares.
+#: Number of adjacent rows in a group, number of alternating selections, and shares of drawn rows.
 RUN, CHOICES, SHARES = 64, 8, (0.1, 0.2, 0.3, 0.5, 0.7)
 
 
 def milliseconds(count: int, share: float, most: float, reps: int) -> float:
-    """Return the median milliseconds of a step with the flush, for [count, 15, 3] elements."""
+    """Return the median milliseconds of a step including the flush, for [count, 15, 3] elements."""
     late.MOST_ROWS = most  # type: ignore[misc] - both ways are measured
     rng = np.random.default_rng(0)
     param, state, rows_late = torch.randn(count, 15, 3), AdamState(), late.Late()

@@ -1,9 +1,10 @@
-"""Tables of a sweep's arms, scene by scene: quality, cost and commit.
+"""Print tables of a sweep's arms by scene: quality, cost and commit.
 
     crossgrad sweep benchmarks/grids/backbones.yaml
     python benchmarks/arms.py runs/sweeps/backbones > tables.md
 
-Values are means over seeds, with standard deviations if there are several seeds. Imports no torch.
+Values are means over seeds, with standard deviations if there are several seeds. This script does
+not import torch.
 """
 
 import argparse
@@ -24,9 +25,9 @@ from crossgrad_plugins.compare.quantity import Quantity
 from crossgrad_plugins.compare.run import Run
 
 PSNR = Quantity.of("psnr")
-#: Overall, and the regimes by their names in scenes.
+#: Row of the table -> its regimes in scenes. None stands for all views.
 REGIMES = {"overall": (None,), "far": ("far", "aerial"), "near": ("near", "street")}
-#: Numbers of summary.json -> titles of their columns.
+#: Keys of summary.json -> column titles.
 NUMBERS = {"step": "steps", "views": "views", "primitives": "Gaussians", "cpu_seconds": "CPU s"}
 
 
@@ -165,7 +166,7 @@ def main() -> None:
     given = parser.parse_args()
     runs = read(given.sweeps)
     if given.baseline is not None and given.baseline not in runs.by_arm:
-        parser.error(f"no arm {given.baseline}; there are {', '.join(runs.by_arm)}")
+        parser.error(f"no arm {given.baseline}; the arms are {', '.join(runs.by_arm)}")
     print("\n".join(arms(runs, given.figures)))
     if given.baseline is not None:
         print()

@@ -1,10 +1,10 @@
-"""Seconds of a whole training step of each backbone, compared with vanilla, as a Markdown table.
+"""Compare the time of a training step of each backbone with vanilla, as a Markdown table.
 
     python benchmarks/backbone_cost.py SCENE [--max-size 400] [--steps 400] [--reps 40]
 
-Each backbone is trained for --steps steps. Then one view is trained on repeatedly: by the backbone,
-and alternately by a vanilla model of the same Gaussians that the backbone draws for this view. Both
-draw the same number of Gaussians, and the ratio is taken pairwise, step by step. The first row
+Each backbone is trained for --steps steps. Then the backbone and a vanilla model take alternate
+steps on one view. The vanilla model contains the Gaussians that the backbone draws for this view.
+Both draw the same number of Gaussians, and the ratio is taken pairwise, step by step. The first row
 compares vanilla with itself.
 """
 
@@ -45,7 +45,7 @@ def trained(scene: Scene, config: RunConfig, steps: int) -> tuple[Setup, TrainSt
 
 
 def on_one_view(setup: Setup, state: TrainState) -> Setup:
-    """Return the same run on only its first training view, in the middle of the schedule."""
+    """Return the run restricted to its first training view, in the middle of the schedule."""
     scene = replace(setup.scene, train=setup.scene.train[:1])
     state.step = START
     state.states.pop("sampler", None)  # The sampler stores an order of all views.
@@ -53,7 +53,7 @@ def on_one_view(setup: Setup, state: TrainState) -> Setup:
 
 
 def drawn(setup: Setup, state: TrainState) -> Gaussians:
-    """Return the Gaussians of the single view that touch a pixel."""
+    """Return the Gaussians that touch a pixel of the single view."""
     camera = setup.train_views[0].camera
     with torch.no_grad():
         gaussians = setup.backbone.decode(
@@ -65,7 +65,7 @@ def drawn(setup: Setup, state: TrainState) -> Gaussians:
 
 
 def as_vanilla(setup: Setup, gaussians: Gaussians) -> TrainState:
-    """Return a vanilla state of these Gaussians."""
+    """Return a vanilla training state that contains these Gaussians."""
     if gaussians.colors is not None:
         dc = ((gaussians.colors - 0.5) / SH_C0)[:, None, :]
         gaussians = replace(gaussians, colors=None, sh_dc=dc, sh_rest=None)

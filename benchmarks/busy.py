@@ -1,8 +1,8 @@
-"""The cost of waiting threads: a training step with several wait policies, on idle and busy cores.
+"""Time a training step with several wait policies of threads, on idle and on busy cores.
 
     python benchmarks/busy.py CASE.npz [--rounds N] [--reps N] [--threads N]
 
-Idle OpenMP threads spin for a while. This is fastest if no other program runs. Otherwise spinning
+Idle OpenMP threads spin for a while. Spinning is fastest if no other program runs. Otherwise it
 takes the core from a process that needs it: another program, or even the thread for which the
 spinning threads wait. Each round measures every policy, without other programs and with one
 computing program per core. The table shows medians over the rounds in ms. It also shows the time of

@@ -1,14 +1,14 @@
-"""Runs of a sweep at distances without training photos, compared with photos of another capture.
+"""Evaluate the runs of a sweep on photos of another capture, at other distances.
 
     python benchmarks/distances.py runs/sweeps/GRID --of city_hybrid --on city_unimodal \
         --folders ladder mid --bands 4 --baseline ARM
 
-The finished runs of one scene are evaluated on the views of another capture of the same place, on
-which they were not trained, as by `crossgrad eval RUN --on SCENE [--ply FILE]`. Finished
-evaluations are skipped: next to each table, a file records the scene, the step and the PLY. The
-views of each folder are sorted into bands of distance by the size of a pixel on the visible
-surface, so that a table goes from near to far. The number of measured views is in brackets. Only
-runs that kept their checkpoints can be evaluated.
+The finished runs of one scene are evaluated on the views of another capture of the same place. They
+were not trained on these views. The evaluation is that of `crossgrad eval RUN --on SCENE [--ply
+FILE]`. Finished evaluations are skipped: next to each table, a file records the scene, the step and
+the PLY. The views of each folder are sorted into bands of distance by the size of a pixel on the
+visible surface, so that a table goes from near to far. The table shows the number of measured views
+in brackets. Only runs that kept their checkpoints can be evaluated.
 """
 
 import argparse
@@ -48,7 +48,7 @@ class Band:
 
 
 def bands_of(capture: Capture, folders: Sequence[str], count: int) -> list[Band]:
-    """Return each folder's views in `count` bands of equal numbers, near bands first."""
+    """Return each folder's views in `count` bands with equal numbers of views, near bands first."""
     found = capture.scene
     unit = found.similarity.scale
     bands = []
@@ -150,7 +150,7 @@ def figures_of(
     tables = [Table(run, capture, file) for run in runs]
     found = {table.run.results.folder: table.figures(name) for table in tables}
     if unmarked := sum(table.is_unmarked for table in tables):
-        print(f"{unmarked} tables do not say of which scene and step they are", file=sys.stderr)
+        print(f"{unmarked} tables do not record their scene and step", file=sys.stderr)
     return found
 
 
@@ -161,11 +161,13 @@ def main() -> None:
     parser.add_argument("--of", required=True, metavar="NAME", help="scene of the runs")
     parser.add_argument("--on", type=Path, required=True, metavar="SCENE")
     parser.add_argument("--arms", nargs="+", help="only these")
-    parser.add_argument("--folders", nargs="+", default=[], help="of SCENE; all by default")
-    parser.add_argument("--bands", type=int, default=1, help="bands of distance per folder")
+    parser.add_argument("--folders", nargs="+", default=[], help="folders of SCENE; default: all")
+    parser.add_argument("--bands", type=int, default=1, help="number of distance bands per folder")
     parser.add_argument("--figure", default=PSNR.name, help="a column of per_view.csv")
-    parser.add_argument("--files", action="store_true", help="their PLY on black instead")
-    parser.add_argument("--baseline", metavar="ARM", help="differences from this arm")
+    parser.add_argument(
+        "--files", action="store_true", help="evaluate the PLY of the runs, drawn on black"
+    )
+    parser.add_argument("--baseline", metavar="ARM", help="show differences from this arm")
     given = parser.parse_args()
     try:
         print_tables(given, _runs(given, parser))
@@ -188,7 +190,7 @@ def _runs(
         parser.error(f"no arm {given.baseline}; there are {', '.join(runs) or 'none'}")
     sizes = {run.config["data"]["max_size"] for own in runs.values() for run in own.values()}
     if len(sizes) != 1:
-        parser.error(f"runs of one size of photos are needed; there are {sizes or 'none'}")
+        parser.error(f"all runs must have photos of one size; there are {sizes or 'none'}")
     return runs
 
 

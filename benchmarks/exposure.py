@@ -1,4 +1,4 @@
-"""Differences in exposure between the photos of scenes, by SfM tracks, for docs/exposure.md.
+"""Measure differences in exposure between photos from SfM tracks, for docs/exposure.md.
 
     python benchmarks/exposure.py SCENE [SCENE ...]
 
@@ -20,14 +20,14 @@ HEADER = (
 )
 
 
-def row(name: str, told: int, gains: TrackGains, seconds: float) -> str:
-    """Return the line of a scene. `told` photos have an EXIF header with their exposure."""
+def row(name: str, with_exif: int, gains: TrackGains, seconds: float) -> str:
+    """Return the line of a scene. `with_exif` photos have an exposure in EXIF."""
     known = gains.gains[gains.known]
     ends = f"{known.min():+.2f} .. {known.max():+.2f}" if len(known) else "-"
     auto = "gain" if gains.differ else "none"
     deviation = f"{gains.fit.before:.2f} -> {gains.fit.after:.2f}"
     return (
-        f"| {name} | {len(known)} of {len(gains.gains)} | {told} | {gains.spread:.2f} "
+        f"| {name} | {len(known)} of {len(gains.gains)} | {with_exif} | {gains.spread:.2f} "
         f"| {gains.error:.3f} | {ends} | {deviation} | {auto} | {seconds:.1f} |"
     )
 
@@ -39,12 +39,12 @@ def main() -> None:
     print(HEADER)
     for path in parser.parse_args().scenes:
         scene, _ = read_scene(configured({"scene": path, "threads": 1}))
-        told = sum(exposure_value(view) is not None for view in scene.views)
+        with_exif = sum(exposure_value(view) is not None for view in scene.views)
         for view in scene.views:
             view.photo.image()
         start = process_time()
         gains = track_gains(scene, scene.views)
-        print(row(scene.name, told, gains, process_time() - start), flush=True)
+        print(row(scene.name, with_exif, gains, process_time() - start), flush=True)
 
 
 if __name__ == "__main__":

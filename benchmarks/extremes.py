@@ -1,4 +1,4 @@
-"""Errors of float32 against float64 on extreme parameters, as a Markdown table.
+"""Measure errors of float32 on extreme parameters, compared with float64, as a Markdown table.
 
     python benchmarks/extremes.py [BACKBONE ...] [--crowd 20000]
 

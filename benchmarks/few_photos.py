@@ -1,11 +1,11 @@
-"""Scenes with few training photos, made by leaving out training photos of a scene.
+"""Make scenes with few training photos by leaving out training photos of a scene.
 
     python benchmarks/few_photos.py OUT --photos 8 14 --draw 1 SCENES/ochota_kap_hybrid_gain ...
     crossgrad sweep benchmarks/grids/few_photos.yaml --threads 1 --scene OUT/... --scene SCENE
 
-Makes OUT/SCENE-8 and so on. Each folder contains links to photos and cameras, a list of training
-photos drawn at random, and a list of the scene's held-out photos. The program prints the median
-number of training photos in which a point is visible.
+The program makes OUT/SCENE-8 and so on. Each folder contains links to photos and cameras, a list of
+training photos drawn at random, and a list of the scene's held-out photos. The program prints the
+median number of training photos in which a point is visible.
 """
 
 import argparse
@@ -38,12 +38,12 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("scenes", type=Path, nargs="+")
     parser.add_argument("--photos", type=int, nargs="+", default=[8])
-    parser.add_argument("--draw", type=int, default=1, help="which photos")
+    parser.add_argument("--draw", type=int, default=1, help="number of the random draw of photos")
     given = parser.parse_args()
     for scene in given.scenes:
         for photos in given.photos:
             folder = given.out / f"{scene.name}-{photos}"
-            print(folder, f"{made(scene, folder, photos, given.draw):g} photos of a point")
+            print(folder, f"{made(scene, folder, photos, given.draw):g} photos show a point")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The picture of the README: two panels of a run on top of each other, and its curve to the right.
+"""Compose the picture of the README: two panels of a run above each other, its curve on the right.
 
 python benchmarks/figure.py RUN docs/images/boruszyn.png
 """

@@ -1,4 +1,4 @@
-"""A table of held-out photos of finished runs, with and without floaters.
+"""Print a table of held-out photos of finished runs, with and without floaters.
 
     crossgrad run SCENE --seconds 600 --no-rule floaters --out RUN
     python benchmarks/floaters.py RUN ...
@@ -73,7 +73,7 @@ def main() -> None:
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument(
         "--empty", type=float, default=Floaters().empty, metavar="SHARE",
-        help="of the way to the nearest point that a camera sees; 1e9: everywhere",
+        help="empty share of the distance to the nearest point that a camera sees; 1e9: no limit",
     )  # fmt: skip
     arguments = parser.parse_args()
     torch.set_grad_enabled(False)

@@ -1,4 +1,4 @@
-"""Step times, memory and quality on a GPU, as one table. Finished measurements are kept.
+"""Measure step times, memory and quality on a GPU. Finished measurements are kept.
 
     python benchmarks/gpu.py SCENE                                 # all of it
     python benchmarks/gpu.py SCENE --gsplat-examples gsplat/examples
@@ -62,7 +62,8 @@ class Short:
     Args:
         scene: SCENE.
         kept: The file, with one JSON line per case.
-        place: Scene, GPU and commit of the figures. Figures with another place are not used.
+        place: Scene, GPU and commit of the figures. Figures of another scene, GPU or commit are not
+            used.
     """
 
     def __init__(self, scene: Path, kept: Path, place: str) -> None:
@@ -102,7 +103,7 @@ class Short:
         before = torch.cuda.memory_allocated()
         setup, state = self._begun(case)
         setup.rasterizer.self_test("cuda")
-        guard = RollbackGuard(state)  # A run also holds a copy for rollback.
+        guard = RollbackGuard(state)  # A run also keeps a copy for rollback.
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
         seconds = steady(setup, state, case.steps)
@@ -157,7 +158,7 @@ def finished(folder: Path) -> Path | None:
 
 
 def measured(case: Case, scene: Path, out: Path) -> tuple[Path | None, str]:
-    """Return the folder of the case's finished run, trained now if missing, or None and why."""
+    """Train the case's run if it is missing. Return its folder, or None and the reason."""
     folder = out / "runs" / case.name
     if (run := finished(folder)) is not None:
         return run, ""
@@ -228,7 +229,7 @@ def theirs(
             "psnr": _rounded(stop.psnr),
             "primitives": stop.gaussians,
             "peak_mib": round(stop.mib, 1),
-            "note": "its photos, split and loss; seconds as it counts them",
+            "note": "photos, split, loss and seconds of gsplat's trainer",
             "date": _written(stop.file),
         }
         yield own | _paced(stop.step, 1, stop.seconds) | found
@@ -319,12 +320,18 @@ def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scene", type=Path)
-    parser.add_argument("--only", nargs="+", metavar="TEXT", help="cases with it in their name")
-    parser.add_argument("--steps", type=int, default=60, help="measured steps of a short case")
+    parser.add_argument(
+        "--only", nargs="+", metavar="TEXT", help="only cases whose name contains this text"
+    )
+    parser.add_argument(
+        "--steps", type=int, default=60, help="number of measured steps of a short case"
+    )
     parser.add_argument("--long", type=int, default=30_000)
     parser.add_argument("--out", type=Path, default=Path("gpu"))
     parser.add_argument("--gsplat-examples", type=Path)
-    parser.add_argument("--trainer-seconds", type=float, help="at most, of gsplat's trainer")
+    parser.add_argument(
+        "--trainer-seconds", type=float, help="time limit of gsplat's trainer in seconds"
+    )
     arguments = parser.parse_args()
     all_cases = list(cases(arguments.steps, arguments.long))
     if missing := [t for t in arguments.only or () if not any(t in c.name for c in all_cases)]:

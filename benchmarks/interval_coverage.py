@@ -1,4 +1,4 @@
-"""Coverage of the intervals of sigma_w^2, sigma_b^2 and their ratio: how often they are correct.
+"""Measure the coverage of the intervals of sigma_w^2, sigma_b^2 and their ratio.
 
     python benchmarks/interval_coverage.py [repetitions] [noise ...]
 
@@ -101,7 +101,7 @@ def cases(kinds: Sequence[str]) -> Iterable[tuple[str, int, tuple[int, int], flo
 def main() -> None:
     """Print the table."""
     repetitions = int(sys.argv[1]) if len(sys.argv) > 1 else 1000
-    print(f"share of {repetitions} repetitions whose 95 % interval holds the truth, in %")
+    print(f"share of {repetitions} repetitions whose 95 % interval contains the true value, in %")
     print(f"{'noise':<10}{'P':>5}{'views':>9}{'ratio':>7}{'within':>9}{'between':>9}{'ratio':>7}")
     for kind, dimension, sizes, ratio in cases(sys.argv[2:]):
         within, between, quotient = 100.0 * coverage(kind, dimension, sizes, ratio, repetitions)

@@ -1,4 +1,4 @@
-"""Packs the tables of a sweep into one small file, and unpacks it again.
+"""Pack the tables of a sweep into one small file, or unpack this file.
 
     python benchmarks/kept.py pack runs/sweeps/GRID benchmarks/results/GRID.tar.xz
     python benchmarks/kept.py unpack benchmarks/results/GRID.tar.xz runs/sweeps/GRID
@@ -22,7 +22,7 @@ from crossgrad_core.system.text_files import csv_bytes
 
 #: The table of a sweep, which assigns each run to a configuration.
 TABLE = "runs.csv"
-#: The rows of that table, the first row being its header.
+#: Rows of this table. The first row is the header.
 Rows: TypeAlias = Sequence[Sequence[str]]
 
 #: Files of a run that are packed. The second line is written by the observer `diagnostics`, and
@@ -53,7 +53,7 @@ def pack(sweep: Path, archive: Path) -> int:
         raise UserError(
             "nothing to keep",
             where=sweep,
-            expected="the folder of a sweep, with runs that finished and their table runs.csv",
+            expected="the folder of a sweep with finished runs and their table runs.csv",
             found=f"{len(runs)} finished runs" if runs else "none",
             todo="name the folder that `crossgrad sweep` printed",
         )
@@ -75,8 +75,8 @@ def _check_labelled(sweep: Path, runs: Iterable[str]) -> None:
             "runs are not in the table of the sweep",
             where=sweep / TABLE,
             expected="a row for each folder below runs/",
-            found=f"none for {len(without)} of them: {', '.join(without[:5])}",
-            todo="unpack the file that they came from once more, or move the folders away",
+            found=f"no row for {len(without)} runs: {', '.join(without[:5])}",
+            todo="unpack the archive of these runs again, or move their folders away",
         )
 
 
@@ -105,8 +105,7 @@ def _without_owner(entry: tarfile.TarInfo) -> tarfile.TarInfo:
 def unpack(archive: Path, sweep: Path) -> int:
     """Add the packed runs to the folder of a sweep. Existing runs are not changed.
 
-    Rows that the table of the sweep does not contain are appended, including rows of runs that
-    exist already.
+    New rows are appended to the table of the sweep, including rows of existing runs.
 
     Returns:
         The number of added runs.
@@ -143,7 +142,7 @@ def _merged(sweep: Path, rows: Rows, runs: Container[str]) -> Rows | None:
             where=sweep / TABLE,
             expected=", ".join(rows[0]),
             found=", ".join(own[0]),
-            todo="unpack into a folder of its own",
+            todo="unpack into a separate folder",
         )
     new = [row for row in rows[1:] if row not in own and row and row[0] in runs]
     return [*own, *new] if new else None

@@ -1,18 +1,20 @@
-"""Training on thousands of large photos, compared with training with all photos in memory.
+"""Compare training on thousands of large photos with training on photos in memory.
 
     python benchmarks/large_sets.py [--photos 2000] [--max-size 1600] [--passes 2] [--block 25]
         [--distorted] [--warm] [--folder DIR]
 
 The scene is made from the bundled scene: its 28 photos are enlarged tenfold to 4000 x 2980 pixels,
-with grain, saved as JPEG and linked under the requested number of names. Cameras are repeated with
-them. crossgrad treats every name as a separate photo, in memory and on disk. Two processes take the
-same steps (`--sampler epoch`, one view, no density control) in turns of `--block` steps. One
-process is stopped while the other works. One trains on all photos. The other trains on only the 28
-photos, which are in its memory before it begins. Both measure wall time, including decoding.
+with grain, saved as JPEG and linked under the requested number of names. Each name also gets a
+camera. crossgrad treats every name as a separate photo, in memory and on disk. Two processes take
+the same steps (`--sampler epoch`, one view, no density control) in turns of `--block` steps. While
+one process works, the other process is stopped. The first process trains on all photos. The second
+process trains on only the 28 photos, which are in its memory before it begins. Both measure wall
+time, including decoding.
 
-Prints the seconds to the first step, the seconds per step in each pass over the photos, their ratio
-to the other process in the same turns, and resident memory. `--distorted` uses a camera with lens
-distortion. `--warm` starts with the photos that an earlier run of the same `--folder` left on disk.
+The program prints the seconds to the first step, the seconds per step in each pass over the photos,
+and resident memory. It also prints the ratio of seconds to the other process in the same turns.
+`--distorted` uses a camera with lens distortion. `--warm` starts with the photos that an earlier
+run of the same `--folder` left on disk.
 """
 
 import argparse
@@ -32,7 +34,7 @@ from _machine import code, facts
 
 #: Enlargement of the bundled photos.
 SCALE = 10
-#: Standard deviation of the grain, grey levels, and quality of the JPEG files: about 4 MB each.
+#: Standard deviation of the grain in grey levels, and JPEG quality. A file has about 4 MB.
 GRAIN, QUALITY = 4.0, 92
 BUNDLED = Path(__file__).parents[1] / "examples" / "scenes" / "boruszyn"
 
@@ -213,10 +215,10 @@ def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--photos", type=int, default=2000)
-    parser.add_argument("--max-size", type=int, default=1600, help="0: as they are")
+    parser.add_argument("--max-size", type=int, default=1600, help="0: original size")
     parser.add_argument("--cache-mib", type=int, default=1280, help="data.cache_mib")
     parser.add_argument("--passes", type=int, default=2)
-    parser.add_argument("--block", type=int, default=25, help="steps of a turn")
+    parser.add_argument("--block", type=int, default=25, help="number of steps per turn")
     parser.add_argument("--distorted", action="store_true")
     parser.add_argument("--warm", action="store_true")
     parser.add_argument("--folder", type=Path)

@@ -1,4 +1,4 @@
-"""Draws docs/layers.svg: the packages of the code by layer, and their imports.
+"""Draw docs/layers.svg: the packages of the code by layer, and their imports.
 
     python benchmarks/layers.py [--png FILE]
 
@@ -122,5 +122,5 @@ def draw(path: Path) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--png", type=Path, help="another file, to look at")
+    parser.add_argument("--png", type=Path, help="additional PNG file for viewing")
     draw(parser.parse_args().png or ROOT / "docs" / "layers.svg")

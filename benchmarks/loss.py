@@ -1,4 +1,4 @@
-"""Median seconds of the photometric loss with its gradient, fused and in torch, as one JSON line.
+"""Time the photometric loss with its gradient, fused and in torch, as one JSON line.
 
     python benchmarks/loss.py [--width W] [--height H] [--reps N] [--threads N] [--masked]
 

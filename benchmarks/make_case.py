@@ -1,13 +1,13 @@
-"""Makes the case file that is used to time and check rasterizers.
+"""Make the case file that is used to time and check rasterizers.
 
     python benchmarks/make_case.py CASE.npz --garden test_garden.npz
     python benchmarks/make_case.py CASE.npz
 
 With --garden, the result is the case of docs/benchmarks.md. It uses positions, colours and the
 first camera of a photo set of a garden, which gsplat ships for its tests (file
-assets/test_garden.npz of the public repository nerfstudio-project/gsplat, Apache-2.0; from
-Mip-NeRF 360), with random sizes, rotations and opacities. Without --garden, positions and colours
-are random. This case is of the same kind and size and needs no download, but its figures differ.
+assets/test_garden.npz of the public repository nerfstudio-project/gsplat, Apache-2.0; from Mip-NeRF
+360), with random sizes, rotations and opacities. Without --garden, positions and colours are
+random. This case has the same kind and size of data and needs no download, but gives other figures.
 """
 
 import argparse
@@ -89,7 +89,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("case", type=Path, help="the file to write")
     parser.add_argument("--garden", type=Path, help="test_garden.npz of gsplat")
-    parser.add_argument("--gaussians", type=int, default=GAUSSIANS, help="number without --garden")
+    parser.add_argument(
+        "--gaussians", type=int, default=GAUSSIANS, help="number of Gaussians without --garden"
+    )
     arguments = parser.parse_args()
     arrays = garden(arguments.garden) if arguments.garden else made_up(arguments.gaussians)
     np.savez_compressed(arguments.case, **with_attributes(arrays))

@@ -1,4 +1,4 @@
-"""A COLMAP scene moved to map coordinates: the differences of its frame and its PSNR.
+"""Compare the frame and the PSNR of a COLMAP scene before and after a move to map coordinates.
 
     python benchmarks/moved_scene.py SCENE --steps 600 --max-size 100
 
@@ -64,7 +64,9 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--max-size", type=int, default=100)
     parser.add_argument("--offset", type=float, nargs=3, default=(5e5, 5e6, 100.0))
-    parser.add_argument("--runs", type=int, default=10, help="runs from positions a bit aside")
+    parser.add_argument(
+        "--runs", type=int, default=10, help="number of runs from perturbed positions"
+    )
     given = parser.parse_args()
     configure_threads(1)
     reading = {"max_size": given.max_size}

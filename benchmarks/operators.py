@@ -1,4 +1,4 @@
-"""Cost of the operators, compared with plain additions of the same gradients.
+"""Measure the cost of operators, compared with plain additions of the same gradients.
 
 One JSON line per operator:
 
@@ -183,7 +183,7 @@ def _context(gradients: SeparateGradients) -> AggregateContext:
 
 
 def _arithmetic(operator: Operator, views: int) -> float | None:
-    """Return microseconds of `transform` for six blocks, or None for operators on elements."""
+    """Return microseconds of `transform` for six blocks, or None for other operators."""
     if not isinstance(operator, MatrixOperator):
         return None
     context = _context(_apart(_gradients(views, 6_000)))

@@ -1,4 +1,4 @@
-"""The paper's tables and claims on our scenes: tuning, runs, and the page with the results.
+"""Test the paper's tables and claims on our scenes: tune, run, and write the page of results.
 
     python benchmarks/paper.py run [--only GRID,...] [--scenes DIR] [--workers N]
     python benchmarks/paper.py page        # only write the page, from existing runs
@@ -76,7 +76,7 @@ class Place:
         return self.out / grid
 
     def grid(self, grid: str) -> Path:
-        """Return the path of the grid as it is run, with scenes and rates filled in."""
+        """Return the path of the grid that is run, with scenes and rates filled in."""
         return self.out / "grids" / f"{grid}.yaml"
 
     @property
@@ -128,7 +128,7 @@ class Paper:
         return grid.model_copy(update={"seeds": tuple(seeds)}) if seeds else grid
 
     def grids(self) -> dict[str, Grid]:
-        """Return every measured grid, as last run, or else as stored in the repository."""
+        """Return every measured grid in the form of its last run, or else of the repository."""
         found = {
             name: read_grid(path) if path.is_file() else self.source(name)
             for name in self.plan.grids
@@ -216,7 +216,10 @@ class Paper:
         if name == self.plan.best_of.grid:
             best = self._best(self.results(), self.grids())
             if len(best) < BEST:
-                print(f"\n== {name}: waits until the candidates have finished", flush=True)
+                print(
+                    f"\n== {name}: not started, because the candidates have not finished",
+                    flush=True,
+                )
                 return None
             grid = with_methods(grid, best)
             rates = {arm.name: rate_of(arm, best, self.plan) for arm in grid.arms}
@@ -375,16 +378,23 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("what", choices=("run", "page", "estimate"))
     parser.add_argument(
-        "--only", type=lambda text: text.split(","), help="grids, with commas between"
+        "--only", type=lambda text: text.split(","), help="names of grids, separated by commas"
     )
     parser.add_argument("--scenes", type=Path, default=ROOT.parent / "shared" / "scenes",
-                        help="folder of the scenes that the grids name")  # fmt: skip
-    parser.add_argument("--scene", action="append", help="a scene instead, repeatable")
-    parser.add_argument("--seed", action="append", type=int, help="a seed instead, repeatable")
+                        help="folder that contains the scenes of the grids")  # fmt: skip
     parser.add_argument(
-        "--set", action="append", help="KEY=VALUE, a setting of all runs, repeatable"
+        "--scene", action="append", help="scene that replaces the scenes of the grids; repeatable"
     )
-    parser.add_argument("--workers", type=int, help="runs at a time")
+    parser.add_argument(
+        "--seed",
+        action="append",
+        type=int,
+        help="seed that replaces the seeds of the grids; repeatable",
+    )
+    parser.add_argument(
+        "--set", action="append", help="KEY=VALUE: a setting of all runs; repeatable"
+    )
+    parser.add_argument("--workers", type=int, help="number of simultaneous runs")
     parser.add_argument("--out", type=Path, default=ROOT / "runs" / "paper")
     parser.add_argument("--kept", type=Path, default=ROOT / "benchmarks" / "results" / "paper")
     parser.add_argument("--page", type=Path, default=ROOT / "docs" / "results" / "paper.md")

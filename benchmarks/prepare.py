@@ -1,4 +1,4 @@
-"""Duration of `crossgrad prepare`, number of registered photos, and accuracy, in a table.
+"""Measure time, registered photos and accuracy of `crossgrad prepare`, in a table.
 
     python benchmarks/prepare.py PHOTOS SCENE [--truth MODEL ...] [-- OPTION ...]
 
@@ -6,7 +6,7 @@ Each truth is a folder with a COLMAP model of the same photos, matched by name. 
 be in one frame. The prepared cameras are aligned to this frame by the similarity with which most of
 them agree (RANSAC, then least squares over the agreeing cameras). The remaining error is divided by
 the diagonal of the box around all true cameras. Options after `--` are passed to `crossgrad
-prepare`. A finished scene is only evaluated, without times.
+prepare`. If the scene is already finished, the program only evaluates it and shows no times.
 """
 
 import argparse
@@ -42,7 +42,7 @@ def poses_of(folders: Sequence[Path]) -> Poses:
 
 
 def errors_of(found: Poses, truth: Poses) -> tuple[dict[str, tuple[float, float]], float]:
-    """Return name -> error as a share of the scene's size, and degrees; and the scene's size."""
+    """Return name -> (error as a share of the scene's size, angle in degrees), and this size."""
     names = sorted(found.keys() & truth.keys())
     here = np.array([found[name][1] for name in names])
     there = np.array([truth[name][1] for name in names])
@@ -91,7 +91,7 @@ def rows(scene: Path, truth: Poses) -> list[str]:
                       f"{np.median(angles):.3f}", f"{(distances <= CLOSE).sum()}"]  # fmt: skip
         lines.append("| " + " | ".join(cells) + " |")
     if truth:
-        lines.append(f"\nsize of the scene: {size:.1f} units of the truth")
+        lines.append(f"\nsize of the scene: {size:.1f} units of the true model")
     return lines
 
 

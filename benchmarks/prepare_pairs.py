@@ -1,12 +1,12 @@
-"""Correct and wrong pairs among the verified pairs of `crossgrad prepare`.
+"""Count correct and wrong pairs among the verified pairs of `crossgrad prepare`.
 
     python benchmarks/prepare_pairs.py PHOTOS SCENE --truth MODEL [--truth MODEL ...] [--map]
 
-For each two folders, the table shows the number of pairs with verified matches, by the number of
-matches, and the number of wrong pairs. A pair is wrong if fewer than half of its matches are within
-four pixels of the epipolar lines of the true poses. With `--map`, cameras are found again with only
-the correct pairs, at COLMAP's thresholds and at half of them. This is an upper bound for any
-selection of pairs.
+For each pair of folders, the table counts the photo pairs with verified matches and the wrong photo
+pairs, by number of matches. A pair is wrong if fewer than half of its matches are within four
+pixels of the epipolar lines of the true poses. With `--map`, cameras are found again with only the
+correct pairs, at COLMAP's thresholds and at half of them. This is an upper bound for any selection
+of pairs.
 """
 
 import argparse
@@ -28,7 +28,8 @@ from prepare import CLOSE, Poses, errors_of, poses_of
 BOUNDS = (15, 20, 30, 60, 100)
 #: Pixels to the epipolar line, and least share of matches within this distance.
 NEAR, RIGHT = 4.0, 0.5
-#: Number of points for a pose, and their share of the tried points: COLMAP's, and half of it.
+#: Thresholds for a pose, COLMAP's and half of them: number of points, and share of the tried
+#: points.
 THRESHOLDS = ((30, 0.25), (15, 0.125))
 
 Matrix = NDArray[np.float64]
@@ -42,7 +43,7 @@ class Pair:
         numbers: Numbers of the two photos in the database.
         names: Names of the two photos.
         matches: Number of verified matches.
-        right: True if most of them agree with the true poses.
+        right: True if most of these matches agree with the true poses.
     """
 
     numbers: tuple[int, int]
@@ -156,7 +157,9 @@ def main() -> None:
     parser.add_argument("photos", type=Path)
     parser.add_argument("scene", type=Path)
     parser.add_argument("--truth", type=Path, action="append", required=True)
-    parser.add_argument("--map", action="store_true", help="find cameras with the right pairs")
+    parser.add_argument(
+        "--map", action="store_true", help="also find the cameras from only the correct pairs"
+    )
     given = parser.parse_args()
     truth, path = poses_of(given.truth), given.scene / "prepare" / "database.db"
     pairs = list(judged(path, truth, intrinsics_of(given.truth)))

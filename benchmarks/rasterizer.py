@@ -1,4 +1,4 @@
-"""Times a rasterizer forward and backward to all parameters on a fixed case, as one JSON line.
+"""Time a rasterizer forward and backward to all parameters on a fixed case, as one JSON line.
 
     NUMBA_NUM_THREADS=1 python benchmarks/rasterizer.py CASE.npz [--rasterizer numba] [--reps 30]
 

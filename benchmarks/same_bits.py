@@ -1,4 +1,4 @@
-"""Test for bit-identical training with two versions of crossgrad.
+"""Test whether two versions of crossgrad train bit-identically.
 
     python benchmarks/same_bits.py OLD_PYTHON NEW_PYTHON [--only TEXT] [--out DIR]
         [--for-new OPTIONS]
@@ -10,8 +10,8 @@ step 20 on, is stopped at step 30 and resumed. Tensors, moments, plugin states, 
 PLY and metrics.csv without its clocks must be equal. The state of slots that only the new version
 has is ignored. The exit status is 1 if there is a difference.
 
-If a difference is intended, the commit that makes it explains it. If a default changed, `--for-new
-"--schedule-unit steps"` gives the new version options that keep the old behaviour.
+If a difference is intended, its commit must explain the difference. If a default changed,
+`--for-new "--schedule-unit steps"` gives the new version options that keep the old behaviour.
 """
 
 import argparse
@@ -187,7 +187,7 @@ def main() -> None:
     parser.add_argument("old", help="interpreter with the old version")
     parser.add_argument("new", help="interpreter with the new version")
     parser.add_argument("--only", default="", help="only cases whose name contains this text")
-    parser.add_argument("--out", type=Path, help="where the runs go; default: a temporary folder")
+    parser.add_argument("--out", type=Path, help="folder for the runs; default: a temporary folder")
     parser.add_argument(
         "--for-new", type=shlex.split, default=[], help="options that only the new version gets"
     )

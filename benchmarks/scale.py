@@ -1,18 +1,18 @@
-"""Step time and peak memory by number of Gaussians, image size, K and threads: table and figure.
+"""Measure step time and peak memory by number of Gaussians, image size, K and threads.
 
     python benchmarks/scale.py [--full] [--only TEXT] [--reps N] [--out DIR]
 
-The scene is synthetic and in memory. Cameras in its middle look in some directions. In front of
-each camera is a cloud of Gaussians that it sees. All other Gaussians are outside of all views. A
-`fixed` cell has one direction, so that each step sees the same Gaussians. A `turning` cell has ten
-directions, with a tenth of all Gaussians in each. There, each Gaussian is out of view for ten steps
-on average, and its deferred updates are flushed later. Steps are steps during density control,
-between two edits, with SH degree 3.
+The scene is synthetic and in memory. Cameras in the middle of the scene look in one or ten
+directions. Each camera sees a cloud of Gaussians in front of it. All other Gaussians are outside of
+all views. A `fixed` cell has one direction, so that each step sees the same Gaussians. A `turning`
+cell has ten directions, with a tenth of all Gaussians in each. There, each Gaussian is out of view
+for ten steps on average, and its deferred updates are flushed later. Steps are steps during density
+control, between two edits, with SH degree 3.
 
 Times are CPU seconds. The cells of a group take alternate steps in one process, and ratios are
 medians over pairs with the group's first cell. Memory is the largest resident set of a separate
-process, including the copy for rollback. The bound is the time of the memory traffic alone, at the
-bandwidth of a copy on this machine: every number that a step needs is moved once.
+process, including the copy for rollback. The bound is the time that memory traffic alone would
+take. It assumes that a step moves every number once, at the bandwidth of a copy on this machine.
 
 With `--out`, the program writes scale.json and scale.svg.
 """
@@ -182,7 +182,7 @@ def _turn(angle: float) -> np.ndarray:
 
 
 def _points(cell: Cell) -> np.ndarray:
-    """Return points [N, 3] in random order: all directions' clouds, then unseen points."""
+    """Return points [N, 3] in random order: the clouds of all directions, and unseen points."""
     rng = np.random.default_rng(0)
     tan = np.tan(np.deg2rad(14))
     depth = rng.uniform(1.0, 2.0, cell.gaussians)
@@ -190,7 +190,7 @@ def _points(cell: Cell) -> np.ndarray:
     local = np.column_stack([flat, depth])
     direction = np.arange(cell.gaussians) // cell.visible
     angles = 2 * np.pi * direction / 10
-    # With one direction, the other clouds are behind it. With ten directions, all are seen.
+    # With one direction, the other clouds are behind the camera. With ten, each is seen.
     if cell.directions == 1:
         angles = np.where(direction > 0, np.pi, 0.0)
     c, s = np.cos(angles), np.sin(angles)
@@ -218,7 +218,7 @@ def setup_of(cell: Cell, **options: object) -> "Setup":
             "max_gaussians": cell.gaussians,
             "growth": "unbounded",
             "schedule_unit": "steps",
-            "rules": {"dropout": False},  # Each photo sees all that is in front of it.
+            "rules": {"dropout": False},  # Each photo sees all Gaussians in front of it.
             **options,
         }
     )
@@ -332,7 +332,9 @@ def draw(lines: list[dict[str, Any]], path: Path) -> None:
 def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--full", action="store_true", help="the whole table: half an hour")
+    parser.add_argument(
+        "--full", action="store_true", help="measure the whole table, which takes half an hour"
+    )
     parser.add_argument("--only", default="", help="only groups with this in their title")
     parser.add_argument("--reps", type=int, default=15)
     parser.add_argument("--out", type=Path, help="folder for scale.json and scale.svg")

@@ -1,15 +1,15 @@
-"""A seeded search over scenes that contradict themselves, and over correct scenes.
+"""Count the warnings of the scene check on random contradictory scenes and correct scenes.
 
     python benchmarks/scene_check.py TOWN TOWN TOWN SCENE SCENE [--wrong 240] [--right 400]
         [--trained 60] [--out FILE]
 
-The towns are made by benchmarks/towns.py, with 24 photos of either kind. Each wrong scene has a
+The towns are made by benchmarks/towns.py, with 24 photos of each kind. Each wrong scene has a
 random kind and strength of error, number of photos and points, crop, ratio of fx to fy, and tracks
 or none. Some wrong scenes are trained for 150 steps on photos of 100 pixels. The correct scene from
-which each was made is trained in the same way. `fall` is the difference of the held-out PSNR, as
-mean by kind and strength. `found` counts the scenes that were reported with the correct cause or
-with the correct photos. Correct scenes have random photos and points, gains, noise, JPEG quality
-and frames. None of them should get a warning.
+which each was made is trained in the same way. `fall` is the difference in held-out PSNR between
+the two trainings, as a mean by kind and strength. `found` counts the scenes that were reported with
+the correct cause or with the correct photos. Correct scenes have random photos and points, gains,
+noise, JPEG quality and frames. None of them should get a warning.
 """
 
 import argparse
@@ -39,7 +39,7 @@ from crossgrad_core.run.export import renderer
 from crossgrad_core.scene.self_check.evidence import pixels_of
 from crossgrad_core.scene.self_check.verdict import Verdict, verdict_of
 
-#: A fall of the held-out PSNR that must be reported, in dB.
+#: The check must report a scene whose held-out PSNR falls by this value, in dB.
 FALL = 3.0
 
 
@@ -55,8 +55,9 @@ class Outcome:
         photos: Number of photos.
         tracks: True if its points have tracks.
         reported: The reported text.
-        found: True if the correct cause or photos, or for a correct scene nothing, were reported.
-        fall: Fall of the held-out PSNR in dB, or None if it was not trained.
+        found: True if the check reported the correct cause or photos, or nothing for a correct
+            scene.
+        fall: Fall of the held-out PSNR in dB, or None if the scene was not trained.
         seconds: CPU seconds of the check.
     """
 
@@ -113,7 +114,7 @@ def text_of(verdict: Verdict) -> str:
 
 
 def is_found(wrong: Wrong, verdict: Verdict) -> bool:
-    """Return whether the correct cause, or about the correct photos, were reported."""
+    """Return True if the correct cause, or roughly the correct photos, were reported."""
     causes = [each.what for each in (verdict.all_wrong, *verdict.some_wrong) if each is not None]
     named = {view for cause in verdict.some_wrong for view in cause.views}
     if not wrong.views:
@@ -187,9 +188,9 @@ def table(outcomes: list[Outcome]) -> Iterator[str]:
     warned = sum(not each.found for each in right)
     yield ""
     yield (
-        f"Kinds and strengths that cost {FALL:g} dB or more in the mean: {found} of {len(hard)} "
-        f"scenes found. Trained scenes that fall by {FALL:g} dB or more: {found_fallen} of "
-        f"{len(fallen)} found. Right scenes: {warned} of {len(right)} got a warning."
+        f"Kinds and strengths with a mean fall of {FALL:g} dB or more: {found} of {len(hard)} "
+        f"scenes found. Trained scenes with a fall of {FALL:g} dB or more: {found_fallen} of "
+        f"{len(fallen)} found. Correct scenes: {warned} of {len(right)} got a warning."
     )
 
 
@@ -199,11 +200,17 @@ def main() -> None:
     parser.add_argument("scenes", type=Path, nargs="+")
     parser.add_argument("--wrong", type=int, default=240)
     parser.add_argument("--right", type=int, default=400)
-    parser.add_argument("--trained", type=int, default=60, help="wrong scenes that are trained")
+    parser.add_argument(
+        "--trained", type=int, default=60, help="number of wrong scenes that are trained"
+    )
     parser.add_argument("--steps", type=int, default=150)
     parser.add_argument("--size", type=int, default=100, help="longest side of the photos")
     parser.add_argument("--first", type=int, default=0, help="first seed")
-    parser.add_argument("--out", type=Path, help="JSON lines: added to, and all are in the table")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        help="file of JSON lines to which outcomes are added; the table shows all",
+    )
     args = parser.parse_args()
     outcomes: list[Outcome] = []
     seeds = range(args.first, args.first + max(args.wrong, args.right))

@@ -1,10 +1,10 @@
-"""A table of the jitter of the test PSNR at the end of runs, for finished runs.
+"""Print the jitter of the test PSNR at the end of finished runs, as a table.
 
     crossgrad sweep benchmarks/grids/steady_ends.yaml --scene SCENE
     python benchmarks/steady_ends.py runs/sweeps/steady_ends
 
 For each run, a straight line is fitted to the PSNR of the evaluations in the last tenth. The
-jitter is the deviation from this line. Imports no torch.
+jitter is the deviation from this line. This script does not import torch.
 """
 
 import argparse

@@ -1,12 +1,12 @@
-"""Median seconds of one whole training step on a fixed case, as one JSON line.
+"""Measure the median seconds of a whole training step on a fixed case, as one JSON line.
 
 A step has the same parts as in a run: decode with SH degree 3, render, loss against a random photo,
 backward pass, and one Adam step. The Adam step of positions is along the axes of their Gaussians.
 The Adam step of colours uses sparse rows: it updates the drawn rows, after their deferred updates
 are flushed. Each timed step follows a step with another view, rotated by `--turn`, so that some
-rows have deferred updates. With two threads, the Adam step of colours overlaps the next step, whose
-`render` includes the rest of it. This does not happen with `--sh-every`, where two kinds of steps
-alternate.
+rows have deferred updates. With two threads, the Adam step of colours overlaps with the next step.
+The time `render` of the next step then includes the rest of the Adam step. This does not happen
+with `--sh-every`, because two kinds of steps alternate.
 
     python benchmarks/step.py CASE.npz [--reps N] [--threads N] [--max-alpha A] [--turn DEGREES]
         [--sh-every N]

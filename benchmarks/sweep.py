@@ -1,11 +1,11 @@
-"""Throughput of a sweep with several workers, compared with the same runs in sequence.
+"""Measure the throughput of a sweep with several workers, relative to the same runs in sequence.
 
     python benchmarks/sweep.py [SCENE] [--runs 6] [--steps 400] [--max-size 400] [--workers 2]
 
 Times three sweeps of the same runs: in sequence with one thread, in sequence with as many threads
 as there are workers, and with all workers, each with one thread. For comparison, it also times as
-many simultaneous `crossgrad run` processes, started by hand, and a single one. The figures are only
-meaningful on a machine without other work.
+many simultaneous `crossgrad run` processes, started by hand, and a single process. The figures are
+only meaningful on a machine without other work.
 """
 
 import argparse
@@ -51,7 +51,7 @@ def by_hand(arguments: argparse.Namespace, folder: Path, count: int) -> float:
     ) for number in range(count)]  # fmt: skip
     for run in runs:
         if run.wait():
-            raise SystemExit("a run failed; `crossgrad run` says why")
+            raise SystemExit("a run failed; start it with `crossgrad run` to see the reason")
     return time.monotonic() - start
 
 

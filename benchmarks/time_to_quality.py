@@ -1,4 +1,4 @@
-r"""Final quality of runs with a time limit, for the code of several commits, run alternately.
+r"""Compare the final quality of runs with a time limit between the code of several commits.
 
     python benchmarks/time_to_quality.py run OUT --scene SCENE [--scene SCENE ...] --core 0 \
         --code old=VENV_OLD/bin/crossgrad --code "new=VENV/bin/crossgrad --split every" \
@@ -175,7 +175,7 @@ def table(given: argparse.Namespace) -> None:
     old: dict[tuple[str, str], dict[int, Row]] = {}
     for (scene, lengths), codes in cases:
         if "old" in codes:
-            # A code that ran alone is compared with the first runs of the same length as `old`.
+            # If a code ran without `old`, compare it with the first runs of `old` of equal length.
             old[scene, lengths] = codes["old"]
             first, _, unit = lengths.partition(" ")
             alone = " ".join([first.split(":")[0], *([unit] if unit else [])])
@@ -272,7 +272,7 @@ def main() -> None:
     """Run missing cases or print a table."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     commands = parser.add_subparsers(required=True)
-    runs = commands.add_parser("run", help="run what is missing")
+    runs = commands.add_parser("run", help="run missing cases")
     runs.set_defaults(do=run)
     runs.add_argument("out", type=Path)
     runs.add_argument("--code", action="append", required=True, metavar="NAME=CROSSGRAD [OPTIONS]")
@@ -282,16 +282,18 @@ def main() -> None:
     runs.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3, 4, 5, 6])
     runs.add_argument("--core", nargs="+", type=int, default=[0])
     runs.add_argument("--max-size", type=int, default=400, metavar="PIXELS")
-    tables = commands.add_parser("table", help="print what there is")
+    tables = commands.add_parser("table", help="print a table of the finished runs")
     tables.set_defaults(do=table)
     tables.add_argument("out", type=Path)
     tables.add_argument("--figure", metavar="NAME")
-    shares = commands.add_parser("share", help="print what short runs have of long ones")
+    shares = commands.add_parser(
+        "share", help="print the share of the long runs' gain that short runs reach"
+    )
     shares.set_defaults(do=share)
     shares.add_argument("out", type=Path)
     given = parser.parse_args()
     if given.do is run and not (given.seconds or given.steps):
-        runs.error("say how long runs are: --seconds or --steps")
+        runs.error("the length of the runs is missing: give --seconds or --steps")
     given.do(given)
 
 

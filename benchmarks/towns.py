@@ -1,4 +1,4 @@
-"""Towns photographed from a drone and from their streets, as COLMAP scenes with exact poses.
+"""Make towns, photographed from a drone and from streets, as COLMAP scenes with exact poses.
 
     python benchmarks/towns.py --seed 1 --out FOLDER [--aerial 64] [--street 64]
 
@@ -7,7 +7,7 @@ streets, heights, patterns, sun and drone flights. The drone flies in rings look
 looking down, or anywhere looking obliquely, 60 to 115 m above ground. Street photos are taken 2 m
 above ground. Points come from the depths of the training photos, with a deviation of 2 cm. Each
 point has up to two further observations in its own kind of photos, and one in the other kind. Every
-eighth photo of either kind gives no points, as `crossgrad run --split every` holds it out.
+eighth photo of each kind gives no points, because `crossgrad run --split every` holds it out.
 """
 
 import argparse
@@ -30,7 +30,7 @@ HALF_ANGLE: Final = {"aerial": 25, "street": 35}
 Integers: TypeAlias = NDArray[np.int64]
 #: Number of blocks and roads in each direction from the middle.
 REACH: Final = 2
-#: One photo of a kind in this number of photos is held out.
+#: Of each kind, one photo out of this many photos is held out.
 EVERY: Final = 8
 
 
@@ -202,7 +202,7 @@ def _vector(row: Array) -> Vector:
 
 
 def walk(rng: np.random.Generator, town: Town, count: int, width: int) -> list[View]:
-    """Return street photos along or across the road, with nothing closer than 4 m in the middle."""
+    """Return street photos along or across the road, without objects within 4 m in the middle."""
     views: list[View] = []
     while len(views) < count:
         line = rng.integers(-1, 2) * town.pitch + rng.uniform(-0.4, 0.4) * town.road
@@ -261,7 +261,7 @@ def _tracks(
     points: Array,
     source: Integers,
 ) -> list[list[int]]:
-    """Return for each point its photos, starting with the photo from which it was taken."""
+    """Return the photos of each point, beginning with the photo from which the point was taken."""
     sees = np.array([_sees(v, d, points) for v, d in zip(views, depths, strict=True)])
     kinds = np.array([view.kind for view in views])
     tracks = []
@@ -342,10 +342,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--aerial", type=int, default=64)
     parser.add_argument("--street", type=int, default=64)
-    parser.add_argument("--width", type=int, default=640, help="of photos, pixels")
+    parser.add_argument("--width", type=int, default=640, help="width of the photos in pixels")
     args = parser.parse_args()
     if min(args.aerial, args.street) < 2 or args.width < 8:
-        parser.error("two photos of either kind or more, of 8 pixels or more across")
+        parser.error("at least two photos of each kind are needed, at least 8 pixels wide")
     rng = np.random.default_rng(args.seed)
     town = build(rng)
     views = [

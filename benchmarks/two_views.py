@@ -1,4 +1,4 @@
-"""The value of the second view of a step: the tables of docs/results/two-views.md.
+"""Compare two views per step with one: the tables of docs/results/two-views.md.
 
     crossgrad sweep benchmarks/grids/two_views_tuning.yaml
     crossgrad sweep benchmarks/grids/two_views_tuning.yaml --best benchmarks/grids/two_views.yaml
@@ -7,7 +7,7 @@
 
 Each arm occurs twice: at its own best factor of the learning rates on each scene, and at the
 published rates. Differences are paired by scene and seed. Verdicts are computed as in
-`crossgrad compare` and corrected over each table. Imports no torch.
+`crossgrad compare` and corrected over each table. This script does not import torch.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from crossgrad_plugins.compare.narrative import needed_text, verdict_text
 from crossgrad_plugins.compare.statistics import Verdict
 
 ONE, TWO = "one view", "two views"
-#: What is equal in a comparison -> two arms, the arm with two views first.
+#: Equal quantities of a comparison -> its two arms, the arm with two views first.
 PAIRS = {
     "seconds": (f"{TWO}, equal seconds", f"{ONE}, equal seconds"),
     "views, events and count": (
@@ -43,12 +43,12 @@ PAIRS = {
         f"{ONE}, equal views, statistics of an extra render",
     ),
 }
-#: Title of each grid of rates -> ending of its arms' names.
-RATES = {"each at its best rates": ", best", "at the published rates": ""}
+#: Title of a table -> ending of the names of its arms.
+RATES = {"at the best rates": ", best", "at the published rates": ""}
 
 
 def differences(runs: Runs, ending: str) -> Iterator[str]:
-    """Yield the table of differences, by what is equal and by regime."""
+    """Yield the table of differences, by equal quantity and by regime."""
     scenes = runs.scenes
     yield from head("two views minus one, at equal ...", "regime", *scenes, "pooled", "verdict")
     wanted = [

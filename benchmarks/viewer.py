@@ -1,4 +1,4 @@
-"""An independent PLY renderer for checks: numpy, float64, one Gaussian after the other.
+"""Render a PLY independently for checks, in numpy and float64, one Gaussian after the other.
 
 It reads the file and draws it by the published rules without code of crossgrad, so that the figures
 of a run for its file can be checked independently.
@@ -71,7 +71,7 @@ def rotations(quats: Array) -> Array:
 
 @dataclass(frozen=True)
 class Projection:
-    """N Gaussians seen by a camera. `pose` [4, 4] maps to camera axes times any number > 0."""
+    """N Gaussians seen by a camera. `pose` [4, 4] maps to camera axes, up to a positive scale."""
 
     ply: dict[str, Array]
     pose: Array
@@ -117,7 +117,7 @@ class Projection:
 
     @cached_property
     def reach(self) -> tuple[Array, Array]:
-        """[2] and [2], the least and the greatest x / z and y / z for the Jacobian."""
+        """[2] and [2]: the smallest and the largest x / z and y / z that the Jacobian uses."""
         focal, center = np.diag(self.k)[:2], self.k[:2, 2]
         low, high = -center / focal, (np.array(self.size) - center) / focal
         margin = (MARGIN - 1) / 2 * (high - low)

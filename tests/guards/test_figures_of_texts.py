@@ -61,7 +61,7 @@ def test_texts_state_both_experiments_at_equal_rendered_views(name):
 
 @pytest.mark.parametrize("name", ["README.md", "crossgrad plan"])
 def test_the_texts_state_the_result_of_the_second_experiment_at_equal_seconds(name):
-    best = TWO_VIEWS.partition("## Each at its best rates")[2]
+    best = TWO_VIEWS.partition("## At the best rates")[2]
     assert of_row("| seconds | overall |", best) in found_in(TEXTS[name]())
 
 
