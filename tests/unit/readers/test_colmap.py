@@ -431,8 +431,8 @@ class TestModels:
 
     def test_a_path_into_a_scene_is_refused(self, make):
         path = make()
-        refuses(model(path), "a folder inside a scene", f"try {path}")
-        refuses(path / "sparse", "a folder inside a scene", f"try {path}")
+        refuses(model(path), "a folder inside a scene", f"use {path}")
+        refuses(path / "sparse", "a folder inside a scene", f"use {path}")
 
     def test_paths_that_are_no_scene(self, make):
         path = make()
