@@ -147,7 +147,7 @@ def test_figures_that_are_not_finite_are_read(tmp_path: Path):
 
 
 def test_a_missing_table_is_explained(tmp_path: Path):
-    with pytest.raises(UserError, match=r"no metrics\.csv"):
+    with pytest.raises(UserError, match=r"does not contain metrics\.csv"):
         read_metrics(tmp_path)
 
 
