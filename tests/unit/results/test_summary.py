@@ -101,7 +101,8 @@ def test_a_failed_run_says_why(tmp_path: Path, summary: Summary):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"), [(None, "does not contain summary.json"), ("{", "summary.json cannot be read")]
+    ("text", "message"),
+    [(None, "does not contain summary.json"), ("{", "summary.json cannot be read")],
 )
 def test_missing_and_damaged_summaries_are_explained(
     tmp_path: Path, text: str | None, message: str
