@@ -86,7 +86,7 @@ _LOOSE: Final = frozenset(
 #: Component that another machine may lack.
 _DRAWN: Final = "rasterizer"
 #: Key that records whether the length follows a time budget.
-_TIMED: Final = "the length follows a time budget"
+_TIMED: Final = "time budget"
 
 
 def settings_of(config: RunConfig) -> dict[str, Json]:

@@ -279,7 +279,7 @@ def _points(was: Fingerprint, now: Fingerprint) -> list[Difference]:
     before, after = was.points, now.points
     if before.count == after.count and _close(before.moments, after.moments):
         return []
-    text = f"other SfM points ({after.count:,}; before: {before.count:,})"
+    text = f"other SfM points ({after.count:,}; before {before.count:,})"
     return [Difference(Weight.CONTENT, text)]
 
 

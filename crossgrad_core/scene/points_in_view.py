@@ -79,11 +79,7 @@ def check_seen(
     cause = _likely_cause(tried, views)
     raise UserError(
         "no photo shows the SfM points: "
-        + (
-            f"the {cause}"
-            if cause
-            else "the points are in another coordinate system than the cameras"
-        ),
+        + (f"{cause}" if cause else "the points are in another coordinate system than the cameras"),
         where=where,
         expected="points in the coordinate system of the cameras",
         found=f"{int(shown.sum())} of {len(shown)} points visible in a photo ({points.source})",

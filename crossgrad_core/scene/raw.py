@@ -189,7 +189,7 @@ def _check_name(raw: RawScene, name: str) -> None:
         )
     if not is_possible_name(name):
         raise UserError(
-            "the image name is not valid",
+            "an image name is not valid",
             where=raw.root,
             expected=f"UTF-8 without control characters, at most {LONGEST_PART} bytes for a file "
             f"or folder and {LONGEST_NAME} in all",

@@ -54,13 +54,13 @@ def read_file(path: Path, weights: Mapping[bytes, int] | None = None, most: int 
     with open_file(path) as file:
         size = os.fstat(file.fileno()).st_size
         if size > most:
-            raise OSError(f"{size_text(size)}; at most {size_text(most)} can be read")
+            raise OSError(f"{size_text(size)}, more than the limit of {size_text(most)}")
         content = file.read(size)
     held = len(content) * (1 if content.isascii() else _WIDEST)
     held += sum(weight * content.count(sign) for sign, weight in (weights or {}).items())
     if held > GROWS * most:
         raise OSError(
-            f"values that need {size_text(held)} in memory; at most "
-            f"{size_text(GROWS * most)} can be used"
+            f"values that need {size_text(held)} in memory, more than the limit of "
+            f"{size_text(GROWS * most)}"
         )
     return content

@@ -88,7 +88,7 @@ def test_a_run_killed_before_its_first_checkpoint_cannot_be_evaluated(killed):
         evaluate.evaluate,
         lambda run: export.export(run, file_format="ply", out=None),
     ):
-        with pytest.raises(UserError, match=rf"no checkpoint yet(.|\n)*--resume {killed} begins"):
+        with pytest.raises(UserError, match=rf"no checkpoint yet(.|\n)*--resume {killed}"):
             look(killed)
     with (
         locked(killed, "training"),

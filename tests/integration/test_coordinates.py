@@ -184,7 +184,7 @@ def test_an_existing_georef_file_next_to_a_named_output_is_not_replaced(trained,
 def test_evaluating_a_ply_in_other_coordinates_is_refused(trained, tmp_path):
     path = tmp_path / "a.ply"
     export.exported(trained, file_format=None, out=path, coordinates="enu")
-    with pytest.raises(UserError, match=r"in other coordinates(?s:.*)--coordinates input"):
+    with pytest.raises(UserError, match=r"uses other coordinates(?s:.*)--coordinates input"):
         evaluate.evaluated_file(trained, path)
 
 

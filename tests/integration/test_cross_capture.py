@@ -67,7 +67,7 @@ def test_cross_capture_leaves_training_photos_out_and_repeats_held_out_metrics(
         assert float(rows[name]["psnr"]) == pytest.approx(float(row["psnr"]), abs=0.02)
     evaluate.evaluate(trained, on=scene)
     printed = capsys.readouterr().out
-    assert "street" in printed and "left out: 7 of its views" in printed
+    assert "street" in printed and "left out: 7 views" in printed
 
 
 def test_a_ply_has_the_same_cross_capture_metrics_as_the_model(trained, scene, capsys):
@@ -81,7 +81,7 @@ def test_a_ply_has_the_same_cross_capture_metrics_as_the_model(trained, scene, c
         assert mine.values["psnr"] == pytest.approx(other.values["psnr"], abs=0.02)
     evaluate.evaluate(trained, ply=trained / "point_cloud.ply", on=scene)
     printed = capsys.readouterr().out
-    assert "rendered on black" in printed and "left out: 7 of its views" in printed
+    assert "rendered on black" in printed and "left out: 7 views" in printed
     assert sorted(trained.rglob("*")) == before
 
 

@@ -163,7 +163,7 @@ def test_too_few_photos_are_refused_with_the_required_number(tmp_path, photos):
     scene = write_tiny_scene(tmp_path / "few", views=photos)
     with pytest.raises(UserError) as told:
         diagnose(scene, None, {"threads": 1}, QUICK, tmp_path / "out")
-    assert told.value.what == "too few training photos for a probe"
+    assert told.value.what == "the scene has too few training photos for a probe"
     assert "at least 4" in told.value.expected and "sampler" not in told.value.todo
 
 

@@ -237,10 +237,10 @@ def test_a_plugin_that_fails_during_selection_does_not_block_other_plugins(
     installed(monkeypatch, tmp_path / "site", {"rasterizers": {"slow": "Slow"}}, readers=readers)
     assert run(scene, tmp_path / "run") == 0
     said = capsys.readouterr().err
-    assert "note: reader picky left out: ValueError: what is this" in said
-    assert "note: reader lost left out: reader lost cannot be imported" in said
+    assert "note: reader picky cannot be used: ValueError: what is this" in said
+    assert "note: reader lost cannot be used: reader lost cannot be imported" in said
     notes = json.loads((tmp_path / "run" / "summary.json").read_text())["notes"]
-    assert "rasterizer slow left out: ValueError: who knows" in notes
+    assert "rasterizer slow is not used: ValueError: who knows" in notes
 
 
 def test_a_plugin_module_that_calls_exit_on_import_does_not_end_the_command(

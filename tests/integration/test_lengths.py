@@ -247,7 +247,9 @@ def test_every_k_of_a_schedule_must_be_accepted_by_the_components(settings, why)
         assembled(views="1..2@0.5", steps=10, **settings)
 
 
-@pytest.mark.parametrize(("text", "form"), [("1..2", "A..B@SHARE"), ("1..1@0.5", "change")])
+@pytest.mark.parametrize(
+    ("text", "form"), [("1..2", "A..B@SHARE"), ("1..1@0.5", "two different numbers")]
+)
 def test_an_invalid_views_value_is_refused_with_the_expected_form(text, form):
     with pytest.raises(UserError, match=form):
         parsed({"views": text})

@@ -52,7 +52,7 @@ def test_results_without_checkpoints_are_not_overwritten_by_a_restart(run, statu
     ):
         with pytest.raises(UserError, match="the checkpoints of the run are missing") as refused:
             act()
-        assert refused.value.expected.startswith("step 6")
+        assert refused.value.expected.startswith("the checkpoint of step 6")
         assert contents(run) == before
 
 

@@ -164,7 +164,7 @@ def test_a_missing_package_is_named_with_its_version(scene, tmp_path, stopped, i
         assert ended(*command) == 2
         told = capsys.readouterr().err
         assert "of versioned-package" in told
-        assert "found:    no package versioned-package" in told
+        assert "found:    package versioned-package is not installed" in told
         assert "pip install versioned-package==1.0" in told
     assert contents(whole) == before
 

@@ -72,7 +72,7 @@ def test_summary_json_has_the_numbers_of_a_consistent_scene(scenes, tmp_path):
 def test_check_prints_inconsistent_photos_first_and_the_verdict_last(scenes):
     lines = lines_of(scenes / "exchanged", [])
     assert "0003.png, 0006.png" in lines[0]
-    assert lines[-1].startswith("verdict: some photos disagree; 10 of 10 photos")
+    assert lines[-1].startswith("verdict: some photos do not match; 10 of 10 photos")
     assert len(lines) <= 15
 
 

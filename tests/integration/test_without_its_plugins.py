@@ -95,7 +95,7 @@ def test_changed_settings_are_refused_even_without_the_plugins(run, capsys):
         ("max_alpha: 0.99", "max_alpha: 0.5", "rasterizer.max_alpha"),
         ("near: ", "near: 1", "rasterizer.near"),
         ("revisions: []", "revisions: [[1, 2]]", "revisions"),
-        ("planned_seconds: null", "planned_seconds: 5.0", "follows a time budget"),
+        ("planned_seconds: null", "planned_seconds: 5.0", "time budget"),
     ],
 )
 def test_changed_render_and_length_settings_are_refused_without_the_plugins(

@@ -96,7 +96,7 @@ def _rows(file: Path) -> list[_Row]:
         UserError: The file cannot be read, a column is missing, or a row has a wrong cell count.
     """
     columns = Columns.of(file, COLUMNS)
-    rows = read_rows(file, "the CSV of RealityCapture", _TODO, delimiter=columns.delimiter)
+    rows = read_rows(file, "the CSV file of RealityCapture", _TODO, delimiter=columns.delimiter)
     header = columns.names
     missing = [
         name for name in (f"#{NAME_COLUMN}", *POSE_COLUMNS, "f") if name.strip("#") not in header

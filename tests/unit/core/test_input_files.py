@@ -85,7 +85,7 @@ def test_a_file_above_the_size_limit_is_not_read(name, tmp_path):
     with path.open("wb") as file:
         file.truncate(1 << 42)  # takes no room
     parse, error = PARSERS[name]
-    with pytest.raises(error, match="at most 64"):
+    with pytest.raises(error, match="more than the limit of 64"):
         parse(path)
 
 

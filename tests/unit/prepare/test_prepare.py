@@ -472,7 +472,7 @@ def test_unknown_choices_are_refused(option, tmp_path, capsys):
     [
         (("--lens", "monocle"), "camera model is unknown"),
         (("--lens", "equirectangular"), "cut them into perspective photos"),
-        (("--matching", "spatial"), "no GPS"),
+        (("--matching", "spatial"), "needs GPS"),
         (("--masks", "gone"), "mask folder does not exist"),
         ((), "no features"),
     ],

@@ -61,7 +61,7 @@ def test_a_faster_third_party_rasterizer_is_chosen(install):
     install(SOUND, fast="made_up_rasterizer:Fast")
     name, notes = choose_rasterizer("auto", PLAIN)
     assert name == "fast"
-    assert notes == ("rasterizer fast: the fastest of 3 here on cpu",)
+    assert notes == ("rasterizer fast: the fastest of 3 usable rasterizers on cpu",)
 
 
 def test_a_rasterizer_of_speed_zero_is_never_chosen(install):
@@ -93,7 +93,9 @@ def test_a_rasterizer_that_cannot_be_imported_is_left_out_with_a_note(install):
     install(broken="made_up_rasterizer:Broken")
     name, notes = choose_rasterizer("auto", PLAIN)
     assert name == "numba"
-    assert notes[0].startswith("rasterizer broken left out: rasterizer broken cannot be imported")
+    assert notes[0].startswith(
+        "rasterizer broken is not used: rasterizer broken cannot be imported"
+    )
 
 
 def test_a_device_without_a_rasterizer_is_refused():

@@ -433,8 +433,8 @@ class TestModels:
 
     def test_a_path_into_a_scene_is_refused(self, make):
         path = make()
-        refuses(model(path), "a folder inside a scene", f"try {path}")
-        refuses(path / "sparse", "a folder inside a scene", f"try {path}")
+        refuses(model(path), "a folder inside a scene", f"use {path}")
+        refuses(path / "sparse", "a folder inside a scene", f"use {path}")
 
     def test_paths_without_a_scene_are_refused_with_a_suggestion(self, make):
         path = make()

@@ -47,7 +47,7 @@ def test_the_output_folder_may_be_new_or_empty(tmp_path: Path, exists: bool):
 
 def test_results_are_never_overwritten(tmp_path: Path):
     (tmp_path / "metrics.csv").write_text("precious")
-    with pytest.raises(UserError, match=r"never overwritten(.|\n)*metrics\.csv") as caught:
+    with pytest.raises(UserError, match=r"never overwrites results(.|\n)*metrics\.csv") as caught:
         create_run_folder(NAME, out=tmp_path)
     assert (tmp_path / "metrics.csv").read_text() == "precious"
     # There is no run that could go on.

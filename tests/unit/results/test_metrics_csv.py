@@ -147,7 +147,7 @@ def test_infinite_and_nan_metrics_are_read(tmp_path: Path):
 
 
 def test_a_missing_table_is_reported(tmp_path: Path):
-    with pytest.raises(UserError, match=r"no metrics\.csv"):
+    with pytest.raises(UserError, match=r"does not contain metrics\.csv"):
         read_metrics(tmp_path)
 
 

@@ -101,7 +101,8 @@ def test_a_failed_run_records_the_error(tmp_path: Path, summary: Summary):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"), [(None, "no summary.json"), ("{", "summary.json cannot be read")]
+    ("text", "message"),
+    [(None, "does not contain summary.json"), ("{", "summary.json cannot be read")],
 )
 def test_missing_and_damaged_summaries_are_reported(tmp_path: Path, text: str | None, message: str):
     if text is not None:

@@ -115,7 +115,7 @@ def test_changed_new_and_missing_masks_are_reported(scene, change):
         ({"scale": 2.0}, "its unit is 5.46405 input units (before: 2.73202)"),
         ({"offset": (1.0, 0.0, 0.0)}, "its origin moved by 1"),
         ({"width": 24, "height": 16}, "photos with another size, camera or pose: 10 (0000.png"),
-        ({"points": 150}, "other SfM points (150; before: 200)"),
+        ({"points": 150}, "other SfM points (150; before 200)"),
     ],
 )
 def test_another_reconstruction_is_reported(pristine, tmp_path, other, text):
@@ -131,7 +131,7 @@ def test_another_scene_in_the_same_folder_is_reported(pristine, tmp_path):
     write_tiny_scene(tmp_path / "other", views=10, seed=1)
     found = told(tmp_path / "other", taken(pristine))
     assert [text.partition(":")[0] for _, text in found] == [
-        "other SfM points (200; before: 200)", "photos changed",
+        "other SfM points (200; before 200)", "photos changed",
         "masks that were changed, added or removed",
     ]  # fmt: skip
 

@@ -126,11 +126,11 @@ def test_points_of_the_model_have_priority_over_a_ply_in_its_folder(scene):
 
 def test_a_cloud_in_another_frame_is_refused_whether_named_or_found(scene):
     write_ply(scene / "cloud.ply", XYZ + 1000.0)
-    with pytest.raises(UserError, match=r"another frame(?s:.*)cloud\.ply"):
+    with pytest.raises(UserError, match=r"another coordinate system(?s:.*)cloud\.ply"):
         read(scene, points=Path("cloud.ply"))
     (scene / "sparse" / "0" / "points3D.bin").unlink()
     (scene / "cloud.ply").rename(scene / "points.ply")
-    with pytest.raises(UserError, match=r"another frame(?s:.*)points\.ply"):
+    with pytest.raises(UserError, match=r"another coordinate system(?s:.*)points\.ply"):
         read(scene)
 
 

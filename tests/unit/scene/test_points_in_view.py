@@ -43,9 +43,9 @@ def test_points_visible_in_photos_are_accepted(points):
     ("change", "cause"),
     [
         (lambda pose: FLIP @ pose, "OpenGL"),
-        (np.linalg.inv, "inverse"),
-        (lambda pose: FLIP @ np.linalg.inv(FLIP @ pose), "inverse"),
-        (lambda pose: FLIP @ np.linalg.inv(pose), "inverse"),
+        (np.linalg.inv, "inverted"),
+        (lambda pose: FLIP @ np.linalg.inv(FLIP @ pose), "inverted"),
+        (lambda pose: FLIP @ np.linalg.inv(pose), "inverted"),
     ],
 )
 def test_a_known_mistake_in_the_poses_is_named(points, change, cause):

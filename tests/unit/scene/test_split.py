@@ -56,7 +56,7 @@ def test_the_stratified_split_holds_out_every_eighth_photo_of_each_regime(tmp_pa
     result = split_views(NAMES, SceneOptions(split="stratified"), tmp_path, label=by_parity)
     assert result.test == ("00.jpg", "01.jpg", "16.jpg", "17.jpg")
     assert len(result.train) == 24 and result.regimes == by_parity(())
-    assert result.notes == ("split: 24 train, 4 test (1 in 8 by name of each regime)",)
+    assert result.notes == ("split: 24 train, 4 test (1 in 8 by name in each regime)",)
     fourth = SceneOptions(split="stratified", test_every=4)
     assert len(split_views(NAMES, fourth, tmp_path, label=by_parity).test) == 8
 

@@ -178,7 +178,7 @@ def test_a_small_grid_file_with_too_many_runs_is_refused(tmp_path):
     assert len(choices(read_grid(written(tmp_path, grid(4))))) == 10_000
     seeds = "seeds: [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11]\n"
     for text in (grid(80), seeds + grid(4)):
-        with pytest.raises(UserError, match="more than 100,000"):
+        with pytest.raises(UserError, match="at most 100,000"):
             read_grid(written(tmp_path, text))
 
 
