@@ -3,12 +3,15 @@
 import re
 import runpy
 import sys
+import tarfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from crossgrad_core.commands import build, chosen, configured, layered, names
+from crossgrad_core.config import RunConfig
+from crossgrad_core.run.results.config_file import read_config
 from crossgrad_plugins.sweep.grid import choices, read_grid, scene_name
 
 ROOT = Path(__file__).parents[2]
@@ -31,6 +34,17 @@ def ran(monkeypatch, tmp_path):
         runpy.run_path(str(BENCHMARKS / script), run_name="__main__")
 
     return run
+
+
+@pytest.mark.parametrize(
+    "archive", sorted((BENCHMARKS / "results").rglob("*.tar.xz")), ids=lambda path: path.name
+)
+def test_the_first_run_of_every_archive_can_still_be_read(archive, tmp_path):
+    with tarfile.open(archive) as file:
+        configs = [item for item in file if item.name.endswith("config.yaml")]
+        for config in configs[:1]:
+            (tmp_path / "config.yaml").write_bytes(file.extractfile(config).read())
+            RunConfig.model_validate(read_config(tmp_path))
 
 
 @pytest.mark.parametrize("name", DOCS)
