@@ -47,14 +47,10 @@ def packages_of(setup: Setup) -> Packages:
     installed = [installed_as(type(component)) for component in _parts(setup.plugins)]
     installed.append(entries("readers").get(setup.selection.names["reader"]))
     packages = {OURS: Package(versions=(VERSION,))}
-    foreign = [
-        candidate
-        for candidate in installed
-        if candidate is not None and candidate.distribution != OURS
-    ]
+    foreign = [entry for entry in installed if entry is not None and entry.distribution != OURS]
     for entry in foreign:
-        same = [candidate for candidate in foreign if candidate.distribution == entry.distribution]
-        components = tuple(sorted({_described(candidate) for candidate in same}))
+        same = [other for other in foreign if other.distribution == entry.distribution]
+        components = tuple(sorted({_described(other) for other in same}))
         packages[entry.distribution] = Package(versions=(entry.version,), components=components)
     return packages
 
