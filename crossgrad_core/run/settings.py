@@ -201,7 +201,7 @@ def _rules(option: str, value: object) -> Mapping[str, object]:
                 found=repr(item),
                 todo="`crossgrad plugins list --slot rules` shows all rules",
             )
-        options = {key: option for key, option in choice.items() if key != "name"}
+        options = {key: setting for key, setting in choice.items() if key != "name"}
         options_by_rule[choice["name"]] = option != "no_rule" and (options or True)
     return options_by_rule
 
