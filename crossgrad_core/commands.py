@@ -281,14 +281,14 @@ def chosen(config: "RunConfig") -> "list[tuple[str, ComponentChoice]]":
     """
     from crossgrad_core.config import AUTO, ComponentChoice
 
-    found: list[tuple[str, ComponentChoice]] = []
+    choices_by_slot: list[tuple[str, ComponentChoice]] = []
     for name in type(config).model_fields:
         value = getattr(config, name)
         choices = value if isinstance(value, tuple) else (value,)
         slot = name if name in MANY else plural(name)
-        found += [(slot, each) for each in choices if isinstance(each, ComponentChoice)]
-    found += [("rules", each) for each in config.used_rules]
-    return [(slot, choice) for slot, choice in found if choice.name != AUTO]
+        choices_by_slot += [(slot, item) for item in choices if isinstance(item, ComponentChoice)]
+    choices_by_slot += [("rules", rule) for rule in config.used_rules]
+    return [(slot, choice) for slot, choice in choices_by_slot if choice.name != AUTO]
 
 
 def fingerprint(scene: "Scene", config: "RunConfig") -> str:

@@ -338,7 +338,7 @@ class RunConfig(BaseModel):
     def _old_names(cls, value: object) -> object:
         if not isinstance(value, dict):
             return value
-        return {current_name(key, value): each for key, each in value.items()}
+        return {current_name(key, value): setting for key, setting in value.items()}
 
     @field_validator("operator", mode="before")
     @classmethod
@@ -363,7 +363,7 @@ class RunConfig(BaseModel):
         """Return the options of each rule; `true` or an empty value selects a rule's defaults."""
         if not isinstance(value, Mapping):
             return value
-        return {name: {} if each in (True, None) else each for name, each in value.items()}
+        return {name: {} if options in (True, None) else options for name, options in value.items()}
 
     @field_validator("views_per_step")
     @classmethod
@@ -379,7 +379,7 @@ class RunConfig(BaseModel):
         if value in {"black", "white", "random"}:
             return value
         try:
-            red, green, blue = (float(part) for part in value.split(","))
+            red, green, blue = (float(level_text) for level_text in value.split(","))
         except ValueError:
             red = green = blue = -1.0
         if not all(0.0 <= level <= 1.0 for level in (red, green, blue)):

@@ -76,8 +76,8 @@ def _plain(error: typer.BadParameter) -> str:
     cause = error.__cause__
     if not isinstance(cause, ValidationError):
         return message
-    found = cause.errors()[0]["input"]
-    return message if repr(found) in message else f"{message}; found {found!r}"
+    value = cause.errors()[0]["input"]
+    return message if repr(value) in message else f"{message}; found {value!r}"
 
 
 class PluginCommand(TyperCommand):
@@ -95,9 +95,9 @@ class PluginCommand(TyperCommand):
         Raises:
             UserError: Several packages offer the name, or the command cannot be imported.
         """
-        found = load_command(registry.find(COMMANDS, str(self.name)))
-        own = as_group_member(found, str(self.name))
-        return own.make_context(info_name, args, parent, **extra)
+        command = load_command(registry.find(COMMANDS, str(self.name)))
+        member = as_group_member(command, str(self.name))
+        return member.make_context(info_name, args, parent, **extra)
 
 
 #: Exit status after bad input.
@@ -154,14 +154,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         # Not `app()`, which would replace `sys.excepthook`.
         get_command(app)(args=arguments, prog_name="crossgrad")
     except Exception as error:
-        told = error if isinstance(error, UserError) else failed_plugin(error)
-        if told is None and isinstance(error, OSError) and is_too_long(error):
-            told = path_too_long(error.filename)
-        if told is None:  # Bugs of crossgrad keep their traceback.
+        user_error = error if isinstance(error, UserError) else failed_plugin(error)
+        if user_error is None and isinstance(error, OSError) and is_too_long(error):
+            user_error = path_too_long(error.filename)
+        if user_error is None:  # Bugs of crossgrad keep their traceback.
             raise
         finish()
-        print(f"error: {told}", file=sys.stderr)  # noqa: T201
-        for note in notes_on(told):
+        print(f"error: {user_error}", file=sys.stderr)  # noqa: T201
+        for note in notes_on(user_error):
             print(f"  {note}", file=sys.stderr)  # noqa: T201
         sys.exit(BAD_INPUT)
     finally:

@@ -52,7 +52,7 @@ def _typed(given: Mapping[str, object]) -> Iterator[str]:
         if name == "scene":
             yield "SCENE"
         elif name == "assignments" and isinstance(value, list):
-            keys = (str(each).partition("=")[0] for each in value)
+            keys = (str(assignment).partition("=")[0] for assignment in value)
             yield from (f"--set {key}" for key in keys if key.strip() not in CHANGEABLE)
         else:
             yield f"--{name.replace('_', '-')}"
@@ -172,7 +172,7 @@ def _parameters() -> Iterator[Parameter]:
             yield _setting(option)
     yield from _FRONT
     for heading in HEADINGS:
-        first, *others = (each for each in OPTIONS if each.flag.heading == heading)
+        first, *others = (option for option in OPTIONS if option.flag.heading == heading)
         yield _setting(first)
         if heading == RESULTS:
             yield from _RESUMING
@@ -201,7 +201,7 @@ def _with_options(function: Callable[..., None]) -> Callable[..., None]:
     """Return the function with the signature from which typer reads options."""
     parameters = list(_parameters())
     function.__dict__["__signature__"] = Signature(parameters)
-    function.__annotations__ = {each.name: each.annotation for each in parameters}
+    function.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return function
 
 

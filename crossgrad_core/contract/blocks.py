@@ -147,14 +147,17 @@ class PluginState:
         # Copy the fields one by one, because `deepcopy` fails for the read-only mappings of
         # `EMPTY_STATE`.
         values = deepcopy(dict(self.values), memo)
-        tensors, rows = (deepcopy(dict(part), memo) for part in (self.tensors, self.per_primitive))
+        tensors, rows = (
+            deepcopy(dict(tensors_by_name), memo)
+            for tensors_by_name in (self.tensors, self.per_primitive)
+        )
         return PluginState(values, tensors, rows)
 
     def to(self, device: torch.device) -> "PluginState":
         """Return the state with its tensors on a device."""
         tensors, rows = (
-            {name: tensor.to(device) for name, tensor in each.items()}
-            for each in (self.tensors, self.per_primitive)
+            {name: tensor.to(device) for name, tensor in tensors_by_name.items()}
+            for tensors_by_name in (self.tensors, self.per_primitive)
         )
         return PluginState(self.values, tensors, rows)
 
@@ -265,12 +268,12 @@ def _no_set(edit: Edit, before: int) -> str:
     return ""
 
 
-def _no_list(found: object, dtype: torch.dtype) -> str:
+def _no_list(value: object, dtype: torch.dtype) -> str:
     """Return how an object differs from a 1-D tensor of a dtype; empty if it is such a tensor."""
-    if not isinstance(found, Tensor):
-        return f"of type {type(found).__module__}.{type(found).__name__}, not a tensor"
-    good = found.ndim == 1 and found.dtype == dtype
-    return "" if good else f"{list(found.shape)} of {found.dtype}, not [M] of {dtype}"
+    if not isinstance(value, Tensor):
+        return f"of type {type(value).__module__}.{type(value).__name__}, not a tensor"
+    good = value.ndim == 1 and value.dtype == dtype
+    return "" if good else f"{list(value.shape)} of {value.dtype}, not [M] of {dtype}"
 
 
 def _no_values(new: object, count: int, width: torch.Size) -> str:
@@ -291,7 +294,7 @@ def _no_values(new: object, count: int, width: torch.Size) -> str:
 def _fits(values: Tensor, shape: tuple[int, ...]) -> bool:
     """Return True if values can be written to a tensor of this shape."""
     pairs = zip(reversed(values.shape), reversed(shape), strict=False)
-    return values.ndim <= len(shape) and all(own in (1, size) for own, size in pairs)
+    return values.ndim <= len(shape) and all(length in (1, size) for length, size in pairs)
 
 
 def gather_indices(edit: Edit, primitives: int, device: torch.device) -> tuple[Tensor, Tensor]:

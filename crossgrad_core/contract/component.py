@@ -68,11 +68,11 @@ def with_state(
 
 
 def _wrong_answer(component: Component, method: str, expected: str, answer: object) -> UserError:
-    own = type(component)
-    parts = [type(each).__name__ for each in answer] if isinstance(answer, tuple) else []
+    component_class = type(component)
+    parts = [type(item).__name__ for item in answer] if isinstance(answer, tuple) else []
     return UserError(
-        f"{own.__name__}.{method} returned a value of a wrong type",
-        where=f"{own.__module__}:{own.__qualname__}.{method}",
+        f"{component_class.__name__}.{method} returned a value of a wrong type",
+        where=f"{component_class.__module__}:{component_class.__qualname__}.{method}",
         expected=expected,
         found=f"a tuple: {', '.join(parts)}" if parts else type(answer).__name__,
         todo="repair the plugin, or choose another component",

@@ -217,15 +217,15 @@ def _kinds(
 
     A group of blocks is named by its kind; the group `all` is neutral.
     """
-    known: dict[str, BlockKind] = {
+    kind_by_name: dict[str, BlockKind] = {
         "geometry": "geometry",
         "appearance": "appearance",
         "neutral": "neutral",
         "all": "neutral",
     }
     if granularity in {"block", "gaussian"}:  # A block may have the same name as a group.
-        known = {block.name: block.kind for block in blocks}
-    return tuple(map(known.__getitem__, names))
+        kind_by_name = {block.name: block.kind for block in blocks}
+    return tuple(map(kind_by_name.__getitem__, names))
 
 
 def _counts(
@@ -253,14 +253,14 @@ def _some(flags: NDArray[np.bool_]) -> int:
 
 
 def _misfit(
-    operator: Operator, gramians: NDArray[np.float64], found: NDArray[np.float64]
+    operator: Operator, gramians: NDArray[np.float64], answer: NDArray[np.float64]
 ) -> UserError:
     blocks, views = gramians.shape[:2]
     return UserError(
         f"operator {type(operator).__name__} returned an array of a wrong shape",
         where=f"{blocks} blocks, {views} views",
         expected=f"[{blocks}, {views}] weights, or [{blocks}, R, {views}] matrices",
-        found=f"{list(found.shape)}",
+        found=f"{list(answer.shape)}",
         todo="repair the plugin, or choose another operator",
     )
 

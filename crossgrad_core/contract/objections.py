@@ -22,18 +22,18 @@ def objections_to(selection: Selection) -> list[str]:
 
 def objections_to_views(operator: Operator, selection: Selection) -> list[str]:
     """Return one objection for each number of views that the operator does not support."""
-    name, needed, found = selection.names["operator"], operator.views, []
+    name, needed, objections = selection.names["operator"], operator.views, []
     for views in selection.views.counts:
         counts = sorted(selection.sampler.counts(views))
         if not needed.admits(views):
-            found.append(f"operator {name} needs {needed} (--views); K is {views}")
+            objections.append(f"operator {name} needs {needed} (--views); K is {views}")
         elif not all(map(needed.admits, counts)):
             listed = ", ".join(map(str, counts))
-            found.append(
+            objections.append(
                 f"operator {name} needs {needed}; with sampler {selection.names['sampler']} steps "
                 f"have {listed} views"
             )
-    return found
+    return objections
 
 
 def _of_the_sampler(selection: Selection) -> Iterator[str]:

@@ -318,11 +318,11 @@ class Scene:
 
     def with_points(self, rows: NDArray[np.int64]) -> "Scene":
         """Return the scene with only the points in `rows` [Q] (ascending); views get new rows."""
-        place = np.full(len(self.points), -1)
-        place[rows] = np.arange(len(rows))
+        new_rows = np.full(len(self.points), -1)
+        new_rows[rows] = np.arange(len(rows))
 
         def left(view: View) -> View:
-            seen = place[view.seen]
+            seen = new_rows[view.seen]
             return replace(view, seen=seen[seen >= 0])
 
         sizes, opacities = self.point_sizes, self.point_opacities

@@ -238,8 +238,8 @@ class Schedule:
         the numbers of the published length, or of `counting.schedule_length`.
         """
         pace = counting.views.paced(total)
-        own = pace.views(total) if counting.unit == "views" else total
-        length = own if mode == "scaled" else counting.schedule_length or REFERENCE
+        run_length = pace.views(total) if counting.unit == "views" else total
+        length = run_length if mode == "scaled" else counting.schedule_length or REFERENCE
         schedule = cls(
             mode=mode,
             total=total,
@@ -252,7 +252,7 @@ class Schedule:
             reset_every=length // 10 if length >= SHORTEST_RUN_WITH_RESET else None,
             anchors_from=length // 20,
             anchors_every=max(SHORTEST_ANCHOR_INTERVAL, length // 300),
-            coarse_until=min(length // 4, own // 2),
+            coarse_until=min(length // 4, run_length // 2),
             counting=counting,
             pace=pace,
         )

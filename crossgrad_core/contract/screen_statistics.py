@@ -41,8 +41,8 @@ def directions(record: RenderedView) -> Tensor:
     The dimensions are bins, fields, Gaussians. With the Gaussians last, sums over bins are sums of
     whole rows, which is much faster on the CPU.
     """
-    found = _present(record.screen.directions)
-    bins = found.permute(1, 2, 0).clone(memory_format=torch.contiguous_format)
+    per_pixel = _present(record.screen.directions)
+    bins = per_pixel.permute(1, 2, 0).clone(memory_format=torch.contiguous_format)
     bins[:, 2:4] *= half_size(record, bins)[:, None]
     return bins
 
@@ -54,11 +54,11 @@ def pixels(record: RenderedView) -> Tensor:
 
 def of_photo(record: RenderedView, counts: Tensor) -> Tensor:
     """Convert pixel counts [N] of the render to pixel counts of the full photo (float)."""
-    found = counts.to(record.gaussians.means)
+    counted = counts.to(record.gaussians.means)
     if record.scale == 1.0:
-        return found
+        return counted
     full, drawn = record.view.camera, record.camera
-    return found * (full.width * full.height / (drawn.width * drawn.height))
+    return counted * (full.width * full.height / (drawn.width * drawn.height))
 
 
 def radii(record: RenderedView) -> Tensor:
@@ -104,8 +104,8 @@ def sums(context: DensifyContext, state: PluginState, names: Sequence[str]) -> d
         name = next(b.tensors[0] for b in backbone.blocks() if b.per_primitive)
         tensor = context.parameters[name]
         like = torch.zeros(tensor.shape[0], device=tensor.device)
-    known = state.per_primitive
-    return {n: known[n].clone() if n in known else torch.zeros_like(like) for n in names}
+    stored = state.per_primitive
+    return {n: stored[n].clone() if n in stored else torch.zeros_like(like) for n in names}
 
 
 def add(record: RenderedView, total: Tensor, values: Tensor, rows: Tensor | None = None) -> None:

@@ -87,12 +87,12 @@ class Selection:
             "exporter": self.exporter,
             "grouping": self.grouping,
         }
-        return {slot: each for slot, each in filled.items() if each is not None}
+        return {slot: component for slot, component in filled.items() if component is not None}
 
     @property
     def plugins(self) -> dict[str, object]:
         """Name -> plugin, for the components and the rules."""
-        return {**self.components, **{f"rule:{name}": each for name, each in self.rules.items()}}
+        return {**self.components, **{f"rule:{name}": rule for name, rule in self.rules.items()}}
 
 
 @runtime_checkable

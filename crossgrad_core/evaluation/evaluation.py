@@ -56,10 +56,10 @@ def evaluate(
     with torch.no_grad():
         for view in views:
             compared = compare(view, render_one(view), points)
-            found = _measured(compared, metrics)
-            measured.append(found)
+            metrics_of_view = _measured(compared, metrics)
+            measured.append(metrics_of_view)
             if on_view is not None:
-                on_view(Evaluated(compared, found))
+                on_view(Evaluated(compared, metrics_of_view))
     return summarised(measured, [metric.described() for metric in metrics])
 
 
@@ -71,9 +71,9 @@ def compare(view: View, render: Tensor, points: NDArray[np.float64] | None = Non
 
 
 def _measured(compared: Compared, metrics: Sequence[Metric]) -> ViewMetrics:
-    found = {metric.figure.name: metric.measure(compared) for metric in metrics}
+    answers = {metric.figure.name: metric.measure(compared) for metric in metrics}
     # Convert to float, because a tensor would be written to files in its text form.
-    values = {name: None if value is None else float(value) for name, value in found.items()}
+    values = {name: None if value is None else float(value) for name, value in answers.items()}
     view, mask = compared.view, compared.mask
     masked = mask is not None and not bool(mask.any())
     return ViewMetrics(view.name, view.regime, values, masked)
@@ -92,15 +92,15 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | N
     Source: 3DGS evaluation script: 20 log10(1 / sqrt(MSE)).
     """
     rendered, photo = (
-        each.reshape(-1, 3) if mask is None else each[mask]
-        for each in (to_uint8(image), to_uint8(target))
+        pixels.reshape(-1, 3) if mask is None else pixels[mask]
+        for pixels in (to_uint8(image), to_uint8(target))
     )
     if rendered.numel() == 0:
         return None
     # Squares and sums are whole numbers, which float32 and float64 represent exactly.
     total = 0.0
     for ours, theirs in zip(
-        *(torch.split(each, _AT_ONCE) for each in (rendered, photo)), strict=True
+        *(torch.split(pixels, _AT_ONCE) for pixels in (rendered, photo)), strict=True
     ):
         difference = ours.to(torch.float32) - theirs.to(torch.float32)
         total += float((difference * difference).sum(dtype=torch.float64))

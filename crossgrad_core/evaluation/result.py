@@ -83,8 +83,8 @@ def _means(views: Sequence[ViewMetrics], figures: Sequence[Figure]) -> Means:
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return fsum(known) / len(known) if known else None
+    numbers = [value for value in values if value is not None]
+    return fsum(numbers) / len(numbers) if numbers else None
 
 
 def _reason(figure: Figure, views: Sequence[ViewMetrics]) -> str:

@@ -66,8 +66,10 @@ class DeferredSums(Gradients):
             kept = self._tensors_of(finite[:, -1])
             self._fold({name: g for name, g in self._last.items() if name in kept})
             self._last = {}
-        some = self._tensors_of(np.asarray(finite.any(axis=1)))
-        sums = {name: self._sum.get(name) if name in some else None for name in self._names}
+        with_gradient = self._tensors_of(np.asarray(finite.any(axis=1)))
+        sums = {
+            name: self._sum.get(name) if name in with_gradient else None for name in self._names
+        }
         return {n: g if g is None or divisor == 1 else g / divisor for n, g in sums.items()}
 
     @override
@@ -99,8 +101,8 @@ class DeferredSums(Gradients):
     @cached_property
     def _read(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Two arrays [B, K]: views with finite gradients, and views with non-zero finite ones."""
-        found = [size for view in self._largest for size in view.values()]
-        values = iter(torch.stack(found).tolist() if found else ())
+        magnitudes = [size for view in self._largest for size in view.values()]
+        values = iter(torch.stack(magnitudes).tolist() if magnitudes else ())
         sizes = [{name: next(values) for name in view} for view in self._largest]
         finite = np.ones((len(self._blocks), self.views), np.bool_)
         present = np.zeros_like(finite)

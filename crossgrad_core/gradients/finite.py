@@ -39,20 +39,20 @@ def all_finite_and_present(tensors: Sequence[Tensor | None]) -> list[tuple[bool,
     given = [None if t is None else _elements(t) for t in tensors]
     native = [t for t in given if t is not None and _is_native(t)]
     bits = iter(_largest_bits(native))
-    found = []
+    results = []
     for tensor in given:
         if tensor is None:
-            found.append((True, False))
+            results.append((True, False))
         elif _is_native(tensor):
             most = next(bits)
-            found.append((most < _INFINITY, most > 0))
+            results.append((most < _INFINITY, most > 0))
         elif not tensor.is_cpu and tensor.is_floating_point():
             # Use one pass and one wait for the device.
             value = float(largest(tensor))
-            found.append((isfinite(value), value > 0.0))
+            results.append((isfinite(value), value > 0.0))
         else:
-            found.append((bool(torch.isfinite(tensor).all()), bool(tensor.any())))
-    return found
+            results.append((bool(torch.isfinite(tensor).all()), bool(tensor.any())))
+    return results
 
 
 def _elements(tensor: Tensor) -> Tensor:
@@ -73,8 +73,14 @@ def _largest_bits(tensors: Sequence[Tensor]) -> list[int]:
     sizes = np.array([tensor.numel() for tensor in tensors], np.int64)
     # An empty tensor also counts as one part.
     starts = np.array([0, *np.maximum(1, -(-sizes // PART)).cumsum()], np.int64)
-    found = np.empty(starts[-1], np.uint32)
-    call = parallel if len(found) > _FEW else serial
-    call(largest_bits, np.array([t.data_ptr() for t in tensors], np.int64), sizes, starts, found)
-    most: list[int] = np.maximum.reduceat(found, starts[:-1]).tolist()
+    largest_of_parts = np.empty(starts[-1], np.uint32)
+    call = parallel if len(largest_of_parts) > _FEW else serial
+    call(
+        largest_bits,
+        np.array([t.data_ptr() for t in tensors], np.int64),
+        sizes,
+        starts,
+        largest_of_parts,
+    )
+    most: list[int] = np.maximum.reduceat(largest_of_parts, starts[:-1]).tolist()
     return most

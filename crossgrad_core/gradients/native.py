@@ -56,8 +56,8 @@ def spread_gramian(column: Column, rows: Tensor, count: int) -> NDArray[np.float
     partial = np.zeros((chunks, len(column), len(column)))
     addresses = _addresses([column])[0]
     parallel(dense.spread_gramian, addresses, rows.numpy(), width, count * width, partial)
-    (found,) = dense.summed(partial, np.zeros((chunks, 1), np.int64), 1)
-    return np.asarray(found)
+    (gramian,) = dense.summed(partial, np.zeros((chunks, 1), np.int64), 1)
+    return np.asarray(gramian)
 
 
 def combine(

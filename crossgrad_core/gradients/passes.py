@@ -55,8 +55,8 @@ def column_gramians(columns: Sequence[Column], views: int) -> NDArray[np.float64
         if scale != 1.0:
             gramians[compiled] *= scale**2
     if others:
-        found = torch.stack([generic.gramian(columns[t], scale) for t in others])
-        gramians[others] = found.cpu().numpy()
+        generic_gramians = torch.stack([generic.gramian(columns[t], scale) for t in others])
+        gramians[others] = generic_gramians.cpu().numpy()
     return gramians
 
 
@@ -128,6 +128,6 @@ def row_remainders(
     high, low = np.zeros(gramians.shape), np.zeros(gramians.shape)
     for column in columns:
         if rows and any(gradient is not None for gradient in column):
-            for part, wide in generic.row_pieces(column, rows):
-                add_row_products(wide.cpu().numpy(), high[part], low[part])
+            for piece, wide in generic.row_pieces(column, rows):
+                add_row_products(wide.cpu().numpy(), high[piece], low[piece])
     return left_over(high, low, gramians)

@@ -67,7 +67,7 @@ class DenseGradients(SeparateGradients):
         self._packed = tuple(
             PackedRows([_prepared(view.get(name)) for view in views]) for name in self._tensors
         )
-        self._columns: tuple[Column, ...] = tuple(each.column for each in self._packed)
+        self._columns: tuple[Column, ...] = tuple(packed.column for packed in self._packed)
         self._native = tuple(is_native(column) for column in self._columns)
         self._grouped: dict[Granularity, Groups] = {}
 
@@ -103,8 +103,8 @@ class DenseGradients(SeparateGradients):
         if granularity not in self._lost:
             self._require_unspent()
             # Residuals of infinite or NaN Gramians have no effect.
-            found = np.nan_to_num(self._remainders(granularity), posinf=0.0, neginf=0.0)
-            self._lost[granularity] = found
+            residuals = np.nan_to_num(self._remainders(granularity), posinf=0.0, neginf=0.0)
+            self._lost[granularity] = residuals
         return self._lost[granularity]
 
     @override
@@ -124,8 +124,8 @@ class DenseGradients(SeparateGradients):
         shared: NDArray[np.bool_] = gramians != 0
         doubtful = ~shared & present[:, :, None] & present[:, None, :]
         for i, j in np.argwhere(np.triu(doubtful.any(axis=0), 1)).tolist():
-            found = self._overlap(granularity, i, j, doubtful[:, i, j])
-            shared[:, i, j] |= found
+            overlapping = self._overlap(granularity, i, j, doubtful[:, i, j])
+            shared[:, i, j] |= overlapping
             shared[:, j, i] = shared[:, i, j]
         return shared
 
@@ -243,20 +243,20 @@ class DenseGradients(SeparateGradients):
             return column_remainders(self._columns, self._groups(granularity).of_tensor, raw)
         parts, first = [np.zeros((0, self._views, self._views))], 0
         for block, columns, rows in self._by_block():
-            part = raw[first : first + rows]
+            block_gramians = raw[first : first + rows]
             first += rows
             if block.per_primitive:
-                parts.append(exact.row_remainders(columns, rows, part))
+                parts.append(exact.row_remainders(columns, rows, block_gramians))
             else:
                 group = np.array([0 if name in block.tensors else -1 for name in self._tensors])
-                parts.append(column_remainders(self._columns, group, part))
+                parts.append(column_remainders(self._columns, group, block_gramians))
         return np.concatenate(parts)
 
     def _by_block(self) -> Sequence[tuple[Block, Sequence[Column], int]]:
-        result, place = [], 0
+        result, first = [], 0
         for block, rows in zip(self._blocks, self._rows, strict=True):
-            result.append((block, self._columns[place : place + len(block.tensors)], rows))
-            place += len(block.tensors)
+            result.append((block, self._columns[first : first + len(block.tensors)], rows))
+            first += len(block.tensors)
         return result
 
     def _overlap(
@@ -265,12 +265,12 @@ class DenseGradients(SeparateGradients):
         self._require_unspent()
         if granularity == "gaussian":
             return self._row_overlap(i, j)
-        found = np.zeros_like(doubtful)
+        overlapping = np.zeros_like(doubtful)
         for group, column in zip(self._groups(granularity).of_tensor, self._columns, strict=True):
-            if doubtful[group] and not found[group]:
+            if doubtful[group] and not overlapping[group]:
                 passes = passes_of(column)
-                found[group] = passes.overlap(column, i, j)
-        return found
+                overlapping[group] = passes.overlap(column, i, j)
+        return overlapping
 
     def _row_overlap(self, i: int, j: int) -> NDArray[np.bool_]:
         parts = []
@@ -331,7 +331,7 @@ class DenseGradients(SeparateGradients):
         results: dict[str, Tensor | None] = dict.fromkeys(self._tensors)
         first = 0
         for block, columns, rows in self._by_block():
-            part = weights[first : first + rows]
+            block_weights = weights[first : first + rows]
             first += rows
             for name, column in zip(block.tensors, columns, strict=True):
                 out = self._result(column, np.ones(self._views, np.bool_))
@@ -339,7 +339,7 @@ class DenseGradients(SeparateGradients):
                     continue
                 results[name] = out
                 passes = passes_of(column)
-                passes.row_combine(column, part, out)
+                passes.row_combine(column, block_weights, out)
         self._spent = self._overwrite
         return results
 

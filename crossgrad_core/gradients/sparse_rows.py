@@ -92,16 +92,16 @@ def _union(rows: Sequence[Tensor], count: int) -> Tensor:
     if len(rows) == 1:
         return rows[0]
     there = torch.zeros(count, dtype=torch.bool)
-    for each in rows:
-        there[each] = True
+    for view_rows in rows:
+        there[view_rows] = True
     return there.nonzero()[:, 0]
 
 
 def _on(gradient: Tensor, rows: Tensor) -> Tensor:
     """Return [R, ...], the values of a gradient in `rows`, which contain all of its rows."""
-    own, values = rows_of(gradient), values_of(gradient)
-    if len(own) == len(rows):
+    gradient_rows, values = rows_of(gradient), values_of(gradient)
+    if len(gradient_rows) == len(rows):
         return values.contiguous()
     full = values.new_zeros((len(rows), *values.shape[1:]))
-    full[torch.searchsorted(rows, own)] = values
+    full[torch.searchsorted(rows, gradient_rows)] = values
     return full

@@ -30,8 +30,10 @@ def plain_sums(columns: Sequence[Column], divisor: int, *, keep: bool) -> list[T
         T sums, None for columns without a gradient.
     """
     packed = [PackedRows(column) for column in columns]
-    sums = _plain_sums([each.column for each in packed], divisor, keep=keep)
-    return [each.unpacked(result) for each, result in zip(packed, sums, strict=True)]
+    sums = _plain_sums([packed_column.column for packed_column in packed], divisor, keep=keep)
+    return [
+        packed_column.unpacked(result) for packed_column, result in zip(packed, sums, strict=True)
+    ]
 
 
 def _plain_sums(columns: Sequence[Column], divisor: int, *, keep: bool) -> list[Tensor | None]:
@@ -164,8 +166,8 @@ class SummedGradients(Gradients):
 
     @override
     def is_judged(self, name: str, gradient: Tensor) -> bool:
-        own, version = self._looked.get(name, (None, 0))
-        return gradient is own and gradient._version == version  # noqa: SLF001
+        judged_tensor, version = self._looked.get(name, (None, 0))
+        return gradient is judged_tensor and gradient._version == version  # noqa: SLF001
 
     def _remember(self) -> None:
         """Record the checked sum; only for a single view, because a sum of views may overflow."""
@@ -180,11 +182,13 @@ class SummedGradients(Gradients):
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return two arrays [B]: True for finite block gradients, and for finite non-zero ones."""
         names = [name for block in self._blocks for name in block.tensors]
-        known = all_finite_and_present([view.get(name) for name in names])
-        each = dict(zip(names, known, strict=True))
-        looks = [[each[name] for name in block.tensors] for block in self._blocks]
-        finite = np.array([all(each for each, _ in block) for block in looks], np.bool_)
-        present = np.array([any(each for _, each in block) for block in looks], np.bool_)
+        flags = all_finite_and_present([view.get(name) for name in names])
+        flags_by_name = dict(zip(names, flags, strict=True))
+        looks = [[flags_by_name[name] for name in block.tensors] for block in self._blocks]
+        finite = np.array([all(is_finite for is_finite, _ in block) for block in looks], np.bool_)
+        present = np.array(
+            [any(is_present for _, is_present in block) for block in looks], np.bool_
+        )
         return finite, finite & present
 
     def _fold(self, divisor: int) -> None:

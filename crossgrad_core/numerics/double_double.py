@@ -17,8 +17,8 @@ _SPLITTER = 134217729.0
 def two_sum(a: float, b: float) -> tuple[float, float]:
     """Return the sum and its rounding error."""
     total = a + b
-    part = total - a
-    return total, (a - (total - part)) + (b - part)
+    b_in_total = total - a
+    return total, (a - (total - b_in_total)) + (b - b_in_total)
 
 
 @strict_device

@@ -22,8 +22,8 @@ def sigmoid(values: Tensor) -> Tensor:
     """Return 1 / (1 + exp(-x)) of a floating-point tensor of any shape."""
     if _is_whole(values):
         return torch.sigmoid(values)
-    found: Tensor = _Sigmoid.apply(values)  # type: ignore[no-untyped-call]
-    return found
+    result: Tensor = _Sigmoid.apply(values)  # type: ignore[no-untyped-call]
+    return result
 
 
 class _Sigmoid(torch.autograd.Function):
@@ -32,15 +32,15 @@ class _Sigmoid(torch.autograd.Function):
     @staticmethod
     @override
     def forward(ctx: Any, values: Tensor) -> Tensor:
-        found = sigmoid_(values.clone(memory_format=torch.contiguous_format))
-        ctx.save_for_backward(found)
-        return found
+        result = sigmoid_(values.clone(memory_format=torch.contiguous_format))
+        ctx.save_for_backward(result)
+        return result
 
     @staticmethod
     @override
     def backward(ctx: Any, upstream: Tensor) -> Tensor:
-        (found,) = ctx.saved_tensors
-        gradient: Tensor = torch.ops.aten.sigmoid_backward(upstream, found)
+        (result,) = ctx.saved_tensors
+        gradient: Tensor = torch.ops.aten.sigmoid_backward(upstream, result)
         return gradient
 
 
@@ -51,8 +51,8 @@ def logsigmoid(values: Tensor) -> Tensor:
 
 def sigmoid_(values: Tensor) -> Tensor:
     """Compute `sigmoid` in place, for a contiguous tensor without a gradient."""
-    for part in torch.split(values.view(-1), BLOCK):
-        part.sigmoid_()
+    for block in torch.split(values.view(-1), BLOCK):
+        block.sigmoid_()
     return values
 
 
@@ -64,5 +64,5 @@ def _is_whole(values: Tensor) -> bool:
 def _in_blocks(function: Callable[[Tensor], Tensor], values: Tensor) -> Tensor:
     if _is_whole(values):
         return function(values)
-    parts = [function(part) for part in torch.split(values.flatten(), BLOCK)]
+    parts = [function(block) for block in torch.split(values.flatten(), BLOCK)]
     return torch.cat(parts).view_as(values)

@@ -83,7 +83,7 @@ def _jobs(threads: int) -> list[Jobs]:
     """
     room = np.zeros(2 * threads, np.int64)
     room[0] = threads
-    return [room[: 1 + threads + each] for each in range(threads)]
+    return [room[: 1 + threads + thread] for thread in range(threads)]
 
 
 def parallel(
@@ -106,8 +106,8 @@ class Begun:
     def __init__(
         self, kernel: Callable[Concatenate[Jobs, P], None], *args: P.args, **kwargs: P.kwargs
     ) -> None:
-        own, *others = _jobs(numba.get_num_threads())
-        self._own: Callable[[], None] | None = partial(kernel, own, *args, **kwargs)
+        own_jobs, *others = _jobs(numba.get_num_threads())
+        self._own: Callable[[], None] | None = partial(kernel, own_jobs, *args, **kwargs)
         self._calls = [_Call(partial(kernel, jobs, *args, **kwargs)) for jobs in others]
         if self._calls:
             _helpers(os.getpid()).ask(self._calls)

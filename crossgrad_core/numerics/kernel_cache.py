@@ -115,13 +115,13 @@ class _DiskCache(cast("Any", FunctionCache)):  # type: ignore[misc]
     @override
     def load_overload(self, sig: object, target_context: object) -> object | None:
         """Return the compiled function; None if it must be compiled."""
-        found = None
+        compiled = None
         # Any error of a file is ignored, because the kernel can always be compiled.
         with suppress(Exception):
-            found = super().load_overload(sig, target_context)
-        if found is None:
+            compiled = super().load_overload(sig, target_context)
+        if compiled is None:
             _tell_compiling(_name(self._py_func), kept=True)
-        return cast("object | None", found)
+        return cast("object | None", compiled)
 
     @override
     def save_overload(self, sig: object, data: object) -> None:
@@ -220,14 +220,14 @@ def fingerprint(source: Path) -> str:
 
 
 def _sources(source: Path) -> set[Path]:
-    found: set[Path] = set()
+    sources: set[Path] = set()
     waiting = set(source.parent.glob("*.py"))
     while waiting:
         path = waiting.pop()
-        found.add(path)
+        sources.add(path)
         if _FOLDERS in path.parts or path.parent == source.parent:
-            waiting |= _imported(path) - found
-    return found
+            waiting |= _imported(path) - sources
+    return sources
 
 
 @cache
@@ -236,15 +236,15 @@ def _imported(path: Path) -> frozenset[Path]:
 
     The result is cached, because most kernel files share most of their imports.
     """
-    packages, found = {_CORE, _package_of(path)}, set[Path]()
+    packages, files = {_CORE, _package_of(path)}, set[Path]()
     for node in ast.walk(ast.parse(path.read_bytes())):
         names = [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         for name in names:
             if name.partition(".")[0] in packages:
-                found.update(_file_of(name))
-    return frozenset(found)
+                files.update(_file_of(name))
+    return frozenset(files)
 
 
 def _package_of(path: Path) -> str:

@@ -269,7 +269,7 @@ def _store_triples(at: Site, array: Any, index: Any, x: Any, y: Any, z: Any) -> 
 def _parts(at: Site, array: Any, index: Any, count: int = 3) -> list[Any]:
     """Return the addresses of consecutive vectors of eight."""
     places = [at.builder.add(index, ir.Constant(index.type, i * LANES)) for i in range(count)]
-    return [_element(at, array, place, _floats(LANES)) for place in places]
+    return [_element(at, array, start, _floats(LANES)) for start in places]
 
 
 def _prefetch(at: Site, array: Any, index: Any, *, write: int) -> Any:

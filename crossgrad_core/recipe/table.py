@@ -180,10 +180,10 @@ def short_lines(rows: Iterable[Decision]) -> tuple[str, ...]:
 
 def full_lines(rows: Iterable[Decision]) -> tuple[str, ...]:
     """Return one line for each decision, with its evidence."""
-    told = ((row, "; ".join(filter(None, (row.because, row.evidence)))) for row in rows)
+    explained = ((row, "; ".join(filter(None, (row.because, row.evidence)))) for row in rows)
     return tuple(
         f"{_value_text(row)}: {text}" + (f" ({row.override})" if row.override else "")
-        for row, text in told
+        for row, text in explained
     )
 
 
@@ -204,7 +204,7 @@ def shown(value: object) -> str:
     """Return the text of a value in a table."""
     match value:
         case dict():
-            return ", ".join(f"{name} {shown(each)}" for name, each in value.items()) or "on"
+            return ", ".join(f"{name} {shown(item)}" for name, item in value.items()) or "on"
         case bool():
             return str(value).lower()
         case float():

@@ -27,14 +27,14 @@ def load_command(entry: Entry) -> Command:
     Raises:
         UserError: The object cannot be imported, or it is another kind of object.
     """
-    found = resolve_entry(entry)
-    if isinstance(found, typer.Typer) or inspect.isfunction(found):
-        return found
+    command = resolve_entry(entry)
+    if isinstance(command, typer.Typer) or inspect.isfunction(command):
+        return command
     raise UserError(
         f"command {entry.name} cannot be used",
         where=entry.origin,
         expected="a typer.Typer, or a function with typer's annotations",
-        found=repr(found),
+        found=repr(command),
         todo=f"repair or uninstall {entry.distribution}",
     )
 
@@ -63,9 +63,9 @@ def summary(entry: Entry) -> str:
         tree = ast.parse(_source(module.strip()))
     except (OSError, ValueError, SyntaxError):
         return f"from {entry.distribution} {entry.version}"
-    functions = [each for each in tree.body if isinstance(each, ast.FunctionDef)]
-    own = [ast.get_docstring(each) for each in functions if each.name == name.strip()]
-    text = (own and own[0]) or ast.get_docstring(tree)
+    functions = [node for node in tree.body if isinstance(node, ast.FunctionDef)]
+    docstrings = [ast.get_docstring(node) for node in functions if node.name == name.strip()]
+    text = (docstrings and docstrings[0]) or ast.get_docstring(tree)
     return text.splitlines()[0] if text else f"from {entry.distribution} {entry.version}"
 
 

@@ -98,23 +98,23 @@ def find(slot: str, name: str) -> Entry:
     Raises:
         UserError: No distribution offers the name, or more than one does.
     """
-    found = [entry for entry in offers(slot) if entry.name == name]
-    if not found:
+    named = [entry for entry in offers(slot) if entry.name == name]
+    if not named:
         raise _unknown(slot, name)
-    if len(found) > 1:
-        others = [entry.distribution for entry in found if entry.distribution != OURS]
-        ours = len(others) < len(found)
+    if len(named) > 1:
+        others = [entry.distribution for entry in named if entry.distribution != OURS]
+        ours = len(others) < len(named)
         raise UserError(
-            f"{len(found)} installed packages offer {with_article(singular(slot))} named {name!r}",
+            f"{len(named)} installed packages offer {with_article(singular(slot))} named {name!r}",
             where=singular(slot),
             expected="one package per name",
-            found=listed(f"{entry.distribution} {entry.version}" for entry in found),
+            found=listed(f"{entry.distribution} {entry.version}" for entry in named),
             todo=f"rename it in {listed(others)}, or uninstall that package: the name belongs "
             "to crossgrad"
             if ours
             else "uninstall all of these packages except one",
         )
-    return found[0]
+    return named[0]
 
 
 @overload
@@ -153,11 +153,11 @@ def resolve_entry(entry: Entry) -> object:
     except UserError:
         raise
     except (Exception, SystemExit) as error:
-        place = raised_at(error, entry.package)
+        line = raised_at(error, entry.package)
         others = COMMANDS if entry.slot == COMMANDS else "runs"
         raise UserError(
             f"{singular(entry.slot)} {entry.name} cannot be imported",
-            where=sentences(entry.origin, place),
+            where=sentences(entry.origin, line),
             found=in_one_line(error),
             todo=f"repair or uninstall {entry.distribution}; other {others} still work",
         ) from error
@@ -196,23 +196,23 @@ def quick_answer(entry: Entry) -> Callable[[Any], Any] | None:
     Raises:
         UserError: The function cannot be imported.
     """
-    for each in _offers(tuple(sys.path))[QUICK[entry.slot]]:
-        if (each.name, each.distribution) == (entry.name, entry.distribution):
-            return cast("Callable[[Any], Any]", resolve_entry(each))
+    for announced in _offers(tuple(sys.path))[QUICK[entry.slot]]:
+        if (announced.name, announced.distribution) == (entry.name, entry.distribution):
+            return cast("Callable[[Any], Any]", resolve_entry(announced))
     return None
 
 
 def failed_plugin(error: Exception) -> UserError | None:
     """Return the error for an exception from another package; None for crossgrad's own code."""
-    others = (each for slot in OFFERED for each in offers(slot) if each.distribution != OURS)
-    found = [(entry, place) for entry in others if (place := raised_at(error, entry.package))]
-    if not found:
+    others = (entry for slot in OFFERED for entry in offers(slot) if entry.distribution != OURS)
+    raising = [(entry, line) for entry in others if (line := raised_at(error, entry.package))]
+    if not raising:
         return None
     # If two distributions share a package, prefer the one that contains the module.
-    entry, place = next((one for one in found if one[1].startswith(f"{one[0].file}:")), found[0])
+    entry, line = next((one for one in raising if one[1].startswith(f"{one[0].file}:")), raising[0])
     return UserError(
         f"a plugin of package {entry.distribution} {entry.version} raised an error",
-        where=sentences(*notes_on(error), place),
+        where=sentences(*notes_on(error), line),
         found=in_one_line(error),
         todo=f"repair or uninstall {entry.distribution}, or choose other components",
     )
@@ -230,7 +230,9 @@ def from_elsewhere(names: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
         if entry is not None and entry.distribution != OURS:
             origin = f"{entry.distribution} {entry.version}"
             by_origin.setdefault(origin, []).append(f"{singular(entry.slot)} {entry.name}")
-    return tuple(f"from {origin}: {listed(each)}" for origin, each in sorted(by_origin.items()))
+    return tuple(
+        f"from {origin}: {listed(components)}" for origin, components in sorted(by_origin.items())
+    )
 
 
 @overload
@@ -298,7 +300,7 @@ def _offers(path: tuple[str, ...]) -> dict[str, tuple[Entry, ...]]:  # noqa: ARG
 
     # One call without a filter, because each call scans every installed distribution.
     points = entry_points()
-    found: dict[str, tuple[Entry, ...]] = {}
+    offers_by_slot: dict[str, tuple[Entry, ...]] = {}
     groups = [*OFFERED.items(), (PLANNERS, f"crossgrad.{PLANNERS}")]
     for key, slot, group in [
         *((slot, slot, group) for slot, group in groups),
@@ -308,8 +310,10 @@ def _offers(path: tuple[str, ...]) -> dict[str, tuple[Entry, ...]]:  # noqa: ARG
             Entry(point.name, slot, point.value, *_identity(point.dist))
             for point in points.select(group=group)
         )
-        found[key] = tuple(sorted(described, key=lambda entry: (entry.name, entry.distribution)))
-    return found
+        offers_by_slot[key] = tuple(
+            sorted(described, key=lambda entry: (entry.name, entry.distribution))
+        )
+    return offers_by_slot
 
 
 @cache
@@ -347,25 +351,27 @@ def _resolve(value: str) -> object:
     return reduce(getattr, path, import_module(module.strip()))
 
 
-def _checked(entry: Entry, found: object) -> "type[Component]":
+def _checked(entry: Entry, component: object) -> "type[Component]":
     word = singular(entry.slot)
     base = cast(
         "type[Component]", _resolve(f"crossgrad_core.contract.slots.{word}:{word.capitalize()}")
     )
-    if not (isinstance(found, type) and issubclass(found, base)):
-        raise _wrong_kind(entry, base, f"{found!r}")
-    if isabstract(found):
-        missing = sorted(getattr(found, "__abstractmethods__", ()))
-        raise _wrong_kind(entry, base, f"{found.__name__} without the methods {listed(missing)}")
-    for name, expected, given in wrong_signatures(found, base):
+    if not (isinstance(component, type) and issubclass(component, base)):
+        raise _wrong_kind(entry, base, f"{component!r}")
+    if isabstract(component):
+        missing = sorted(getattr(component, "__abstractmethods__", ()))
+        raise _wrong_kind(
+            entry, base, f"{component.__name__} without the methods {listed(missing)}"
+        )
+    for name, expected, given in wrong_signatures(component, base):
         raise UserError(
             f"{word} {entry.name} has a method with wrong arguments",
-            where=sentences(entry.origin, defined_at(getattr(found, name))),
+            where=sentences(entry.origin, defined_at(getattr(component, name))),
             expected=f"{name}{expected}",
             found=f"{name}{given}",
             todo=f"repair or uninstall {entry.distribution}",
         )
-    return found
+    return component
 
 
 def _wrong_kind(entry: Entry, base: type, found: str) -> UserError:

@@ -146,7 +146,7 @@ def one_by_one(manager: pluggy.PluginManager, name: str) -> tuple[pluggy.HookCal
         if not (implementation.wrapper or implementation.hookwrapper)
     ]
     return tuple(
-        manager.subset_hook_caller(name, [each for each in answering if each is not plugin])
+        manager.subset_hook_caller(name, [other for other in answering if other is not plugin])
         for plugin in answering
     )
 
@@ -183,7 +183,9 @@ def _noted(function: Callable[..., Any], note: str) -> Callable[..., Any]:
 
 def _add_note(error: BaseException, note: str) -> None:
     # An exception that a wrapper passes on comes from another plugin and already has a note.
-    if not any(each.startswith("in hook ") for each in getattr(error, "__notes__", ())):
+    if not any(
+        present_note.startswith("in hook ") for present_note in getattr(error, "__notes__", ())
+    ):
         error.add_note(note)
 
 
@@ -229,11 +231,13 @@ def _may_be_hooks(plugin: object) -> frozenset[str]:
     """Return the attributes that are marked, or of a kind that only pluggy can classify."""
     if inspect.isclass(plugin) or inspect.ismodule(plugin):
         return frozenset(dir(plugin))
-    found: dict[str, object] = {}
+    attributes: dict[str, object] = {}
     for kind in reversed(type(plugin).__mro__):
-        found |= vars(kind)
-    own = getattr(plugin, "__dict__", {})
-    return frozenset(name for name, value in found.items() if _may_be_hook(value)).union(own)
+        attributes |= vars(kind)
+    instance_attributes = getattr(plugin, "__dict__", {})
+    return frozenset(name for name, value in attributes.items() if _may_be_hook(value)).union(
+        instance_attributes
+    )
 
 
 def _may_be_hook(attribute: object) -> bool:
@@ -246,8 +250,8 @@ def _may_be_hook(attribute: object) -> bool:
 
 
 def _is_function(plugin: object, attribute: str) -> bool:
-    found = inspect.getattr_static(plugin, attribute, None)
-    return inspect.isroutine(found)
+    value = inspect.getattr_static(plugin, attribute, None)
+    return inspect.isroutine(value)
 
 
 def _unmarked(name: str, plugin: object, attribute: str) -> UserError:

@@ -26,17 +26,17 @@ def wrong_signatures(found: type, base: type) -> tuple[tuple[str, str, str], ...
 
     Returns: Name, signature in the base class and actual signature, for each such method.
     """
-    contract = [each for each in base.__mro__ if each.__module__.startswith(_CONTRACT)]
-    names = dict.fromkeys(name for each in contract for name in vars(each))
+    contract = [ancestor for ancestor in base.__mro__ if ancestor.__module__.startswith(_CONTRACT)]
+    names = dict.fromkeys(name for ancestor in contract for name in vars(ancestor))
     wrong = []
     for name in names:
-        theirs, own = getattr_static(base, name), getattr_static(found, name)
-        if name.startswith(("_", "crossgrad_")) or own is theirs:
+        theirs, ours = getattr_static(base, name), getattr_static(found, name)
+        if name.startswith(("_", "crossgrad_")) or ours is theirs:
             continue
-        if isfunction(theirs) and isfunction(own):
+        if isfunction(theirs) and isfunction(ours):
             # A decorator may pass its own arguments, so use the signature of the decorated
             # function.
-            expected, given = signature(theirs), signature(own, follow_wrapped=False)
+            expected, given = signature(theirs), signature(ours, follow_wrapped=False)
             if not _takes(given, expected, whole=True) or not _takes(given, expected, whole=False):
                 wrong.append((name, str(expected), str(given)))
     return tuple(wrong)
@@ -45,8 +45,10 @@ def wrong_signatures(found: type, base: type) -> tuple[tuple[str, str, str], ...
 def _takes(given: Signature, expected: Signature, *, whole: bool) -> bool:
     """Return True if a call with all arguments, or with the required ones only, is possible."""
     passed = [p for p in expected.parameters.values() if whole or p.default is Parameter.empty]
-    positional = [each for each in passed if each.kind in _POSITIONAL]
-    named = {each.name: None for each in passed if each.kind is Parameter.KEYWORD_ONLY}
+    positional = [parameter for parameter in passed if parameter.kind in _POSITIONAL]
+    named = {
+        parameter.name: None for parameter in passed if parameter.kind is Parameter.KEYWORD_ONLY
+    }
     try:
         given.bind(*(None for _ in positional), **named)
     except TypeError:
@@ -62,14 +64,14 @@ def raised_at(error: BaseException, package: str) -> str:
         package: Name of the import package or module.
     """
     roots = _roots(package)
-    found = ""
-    for each in _chain(error):
-        if isinstance(each, SyntaxError) and _below(each.filename, roots):
-            return f"{each.filename}:{each.lineno or 1}"
-        for frame in traceback.extract_tb(each.__traceback__):
+    innermost = ""
+    for exception in _chain(error):
+        if isinstance(exception, SyntaxError) and _below(exception.filename, roots):
+            return f"{exception.filename}:{exception.lineno or 1}"
+        for frame in traceback.extract_tb(exception.__traceback__):
             if _below(frame.filename, roots):
-                found = f"{frame.filename}:{frame.lineno or 1}"
-    return found
+                innermost = f"{frame.filename}:{frame.lineno or 1}"
+    return innermost
 
 
 def defined_at(thing: object) -> str:
@@ -82,10 +84,10 @@ def defined_at(thing: object) -> str:
 
 def _chain(error: BaseException) -> Iterator[BaseException]:
     """Yield the exception and the exceptions that caused it."""
-    each: BaseException | None = error
-    while each is not None:
-        yield each
-        each = each.__cause__
+    exception: BaseException | None = error
+    while exception is not None:
+        yield exception
+        exception = exception.__cause__
 
 
 def _roots(package: str) -> tuple[Path, ...]:

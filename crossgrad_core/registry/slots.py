@@ -93,7 +93,9 @@ def strays() -> Iterator[Stray]:
     points = entry_points()
     for group in sorted(points.groups):
         if group not in _KNOWN and _is_like_ours(group):
-            for point in sorted(points.select(group=group), key=lambda each: each.name):
+            for point in sorted(
+                points.select(group=group), key=lambda entry_point: entry_point.name
+            ):
                 dist = point.dist
                 origin = ("unknown", "unknown") if dist is None else (dist.name, dist.version)
                 yield Stray(point.name, group, _meant(group), *origin)

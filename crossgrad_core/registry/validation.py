@@ -28,10 +28,10 @@ def as_user_error(
         todo: Advice for the user.
     """
     details = error.errors(include_url=False)
-    first, places = details[0], [_place(model, each["loc"]) for each in details]
-    place, holder = places[0]
+    first, places = details[0], [_place(model, detail["loc"]) for detail in details]
+    option_path, holder = places[0]
     # A value that fits no branch of a union is reported once for each branch.
-    branches = [each for each, at in zip(details, places, strict=True) if at[0] == place]
+    branches = [detail for detail, at in zip(details, places, strict=True) if at[0] == option_path]
     key, *others = dict.fromkeys(".".join(parts) for parts, _ in places)
     more = f"also wrong: {listed(others)}" if others else ""
     where = ".".join(part for part in (prefix, key) if part) or subject
@@ -41,12 +41,12 @@ def as_user_error(
             f"{subject} has no option {key!r}",
             where=where,
             expected=f"one of {listed(options)}" if options else "no options: it has none",
-            todo=sentences(did_you_mean(place[-1], options), more, todo),
+            todo=sentences(did_you_mean(option_path[-1], options), more, todo),
         )
     return UserError(
         f"option {key} of {subject} is not valid" if key else f"{subject} is not valid",
         where=where,
-        expected=", or ".join(dict.fromkeys(_expected(each) for each in branches)),
+        expected=", or ".join(dict.fromkeys(_expected(detail) for detail in branches)),
         found=_found(first),
         todo=sentences(more, todo),
     )
@@ -67,7 +67,7 @@ def _place(
         annotation, branches = _unwrapped(annotation)
         if len(branches) > 1:
             label = str(rest.pop(0))
-            annotation = next((each for each in branches if _name(each) == label), None)
+            annotation = next((branch for branch in branches if _name(branch) == label), None)
             continue
         part = str(rest.pop(0))
         parts.append(part)
@@ -81,7 +81,7 @@ def _unwrapped(annotation: object) -> tuple[object, Sequence[object]]:
         if get_origin(annotation) is Annotated:
             annotation = get_args(annotation)[0]
         elif get_origin(annotation) in (Union, UnionType):
-            branches = [each for each in get_args(annotation) if each is not NoneType]
+            branches = [branch for branch in get_args(annotation) if branch is not NoneType]
             if len(branches) > 1:
                 return annotation, branches
             annotation = branches[0]
@@ -99,7 +99,7 @@ def _inside(annotation: object, part: str) -> tuple[type[BaseModel] | None, obje
         field = annotation.model_fields.get(part)
         return annotation, field.annotation if field else None
     # The values of a list, a tuple or a mapping.
-    arguments = [each for each in get_args(annotation) if each is not ...]
+    arguments = [argument for argument in get_args(annotation) if argument is not ...]
     return None, arguments[-1] if arguments else None
 
 

@@ -337,12 +337,12 @@ def _within(setup: Setup, seconds: float) -> Setup:
     schedule = schedule_of(setup.config, setup.densifier, steps, setup.schedule.counting)
     setup = replace(setup, schedule=schedule)
     idle = [f"{name} has no effect: {why}" for name, why in without_resets(config, setup)]
-    told = (
+    new_notes = (
         note,
         *notes_on_length(setup),
         *idle,
     )
-    return replace(setup, notes=(*setup.notes, *told))
+    return replace(setup, notes=(*setup.notes, *new_notes))
 
 
 @contextmanager
@@ -458,8 +458,8 @@ def resumed(
                 state.clock.compile += warm_up(setup, state)
         drop_checksums(folder)
         write_scene(folder, fingerprint_of(setup.scene, cast("Path", setup.config.scene)))
-        known = read_plugins(folder, quiet=True) if step else None
-        write_plugins(folder, with_present(known, packages_of(setup)))
+        recorded = read_plugins(folder, quiet=True) if step else None
+        write_plugins(folder, with_present(recorded, packages_of(setup)))
         session = Session.resumed(folder, setup, step)
         length = Forecast(Planned(setup.config.revisions))
         return _train(setup, state, session, length, way.tell)

@@ -77,7 +77,7 @@ def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
     _LOG.info("reading scene %s", path)
     name = config.reader.name
     if name == AUTO:
-        able = [each for each in entries("readers") if accepts(each, path)]
+        able = [reader for reader in entries("readers") if accepts(reader, path)]
         if len(able) > 1:
             raise UserError(
                 "the scene folder contains files of several formats",
@@ -86,7 +86,11 @@ def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
                 todo=f"choose a reader, such as --reader {able[0]}",
             )
         # If no reader recognises the folder, one reader explains what is missing.
-        near = [] if able else [each for each in entries("readers") if nearly_accepts(each, path)]
+        near = (
+            []
+            if able
+            else [reader for reader in entries("readers") if nearly_accepts(reader, path)]
+        )
         name = (*able, *near, READER)[0]
     return build(Reader, name, config.reader.options).read(path, config.data), name
 
@@ -202,7 +206,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     # The length of a run with a time budget is not known yet.
     timed = notes_on_length(setup) if config.seconds is None else ()
     named = {plural(word): [name] for word, name in selection.names.items()}
-    named["operators"] = [each.name for each in config.operators]
+    named["operators"] = [operator.name for operator in config.operators]
     named |= {"metrics": [*selection.metrics], "observers": [*observers]}
     added = (
         *from_elsewhere({**named, "rules": [*selection.rules]}),
@@ -243,8 +247,8 @@ def _with_steps(config: RunConfig, views: ViewsPerStepSpec) -> RunConfig:
         UserError: A single step renders more views than `max_views`.
     """
     if config.max_views is None:
-        known = config.seconds is not None or config.steps is not None
-        return config if known else config.model_copy(update={"steps": DEFAULT_STEPS})
+        has_length = config.seconds is not None or config.steps is not None
+        return config if has_length else config.model_copy(update={"steps": DEFAULT_STEPS})
     steps = views.steps_of(config.max_views)
     if steps == 0:
         raise UserError(

@@ -80,20 +80,20 @@ def zoom_path(views: Sequence[View], points: _Floats, frames: int) -> tuple[Came
     Raises:
         UserError: Fewer than two views observe enough SfM points.
     """
-    known = [view for view in views if len(view.seen) >= FEWEST_SEEN]
-    known = known[:: 1 + len(known) // MOST_VIEWS]
-    if len(known) < 2:  # noqa: PLR2004 - two ends
+    usable = [view for view in views if len(view.seen) >= FEWEST_SEEN]
+    usable = usable[:: 1 + len(usable) // MOST_VIEWS]
+    if len(usable) < 2:  # noqa: PLR2004 - two ends
         raise UserError(
             "no zoom path can be computed from the photos",
             where=f"--path {ZOOM}",
             expected=f"two photos that each observe at least {FEWEST_SEEN} SfM points",
-            found=f"{len(known)}",
+            found=f"{len(usable)}",
             todo="give a camera path as a file: --path FILE.json",
         )
-    distances = np.array([_distance(view.camera, points[view.seen]) for view in known])
-    first, last = _ends(known, distances, len(points))
+    distances = np.array([_distance(view.camera, points[view.seen]) for view in usable])
+    first, last = _ends(usable, distances, len(points))
     nearer = distances[last] / distances[first]
-    ends = known[first].camera, known[last].camera
+    ends = usable[first].camera, usable[last].camera
     return tuple(_between(*ends, share, nearer) for share in np.linspace(0.0, 1.0, frames))
 
 
@@ -107,16 +107,16 @@ def _ends(views: Sequence[View], distances: _Floats, points: int) -> tuple[int, 
     order, few = np.argsort(distances, kind="stable"), max(1, len(views) // 5)
     forward = np.stack([view.camera.world_to_camera[2, :3].numpy() for view in views])
     seen = {int(near): np.unique(views[near].seen) for near in order[:few]}
-    found = []
+    candidates = []
     for far in map(int, order[-few:]):
         mark = np.zeros(points, dtype=np.bool_)
         mark[views[far].seen] = True
-        found += [
+        candidates += [
             (int(mark[rows].sum()), float(forward[far] @ forward[near]), (far, near))
             for near, rows in seen.items()
             if near != far
         ]
-    return max(found)[2]
+    return max(candidates)[2]
 
 
 def _way(share: float, nearer: float) -> float:
@@ -171,16 +171,16 @@ class _Path(BaseModel):
 
 def _read(path: Path, similarity: Similarity) -> CameraPath:
     try:
-        found = _Path.model_validate(read_json(path))
+        content = _Path.model_validate(read_json(path))
     except ValidationError as error:
         raise as_user_error(error, _Path, subject=f"camera path {path}", todo=_TODO) from error
     except (FileNotFoundError, ValueError) as error:
         raise UserError(
             "the camera path cannot be read", where=f"--path {path}", found=str(error), todo=_TODO
         ) from error
-    size = round(found.render_width), round(found.render_height)
-    cameras = [_camera(frame, size, similarity, path) for frame in found.camera_path]
-    return CameraPath(path.stem, tuple(cameras), found.fps)
+    size = round(content.render_width), round(content.render_height)
+    cameras = [_camera(frame, size, similarity, path) for frame in content.camera_path]
+    return CameraPath(path.stem, tuple(cameras), content.fps)
 
 
 def _camera(frame: _Frame, size: tuple[int, int], similarity: Similarity, path: Path) -> Camera:
@@ -234,8 +234,8 @@ def checked_camera(camera: object) -> Camera:
             raise _refused(f"a {name} of at least 1 pixel", repr(side))
     for name in ("fx", "fy", "cx", "cy"):
         value, focal = getattr(camera, name), name in {"fx", "fy"}
-        known = isinstance(value, Real) and isfinite(value)
-        if not known or (focal and value <= 0):
+        is_finite = isinstance(value, Real) and isfinite(value)
+        if not is_finite or (focal and value <= 0):
             above = " above 0" if focal else ""
             raise _refused(f"a finite {name}{above}, in pixels", repr(value))
     if not _is_pose(camera.world_to_camera):

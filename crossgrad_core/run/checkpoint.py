@@ -102,8 +102,8 @@ def named_checkpoints(folder: Path) -> dict[int, Path]:
     """
     if not folder.is_dir():
         return {}
-    found = [path for path in folder.iterdir() if is_checkpoint(path)]
-    by_step = {int(path.name.removeprefix("step-")): path for path in found}
+    folders = [path for path in folder.iterdir() if is_checkpoint(path)]
+    by_step = {int(path.name.removeprefix("step-")): path for path in folders}
     return dict(sorted(by_step.items()))
 
 
@@ -427,8 +427,8 @@ def _drop(folder: Path, keep: Keep, *coming: int) -> bool:
     """Delete the checkpoints that `keep` drops once `coming` exist; return True if any was."""
     steps = named_checkpoints(folder)
     doomed = [steps[step] for step in keep.drops([*steps, *coming]) if step in steps]
-    for each in doomed:
-        discard(each)
+    for checkpoint in doomed:
+        discard(checkpoint)
     return bool(doomed)
 
 

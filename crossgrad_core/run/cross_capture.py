@@ -50,16 +50,16 @@ class Elsewhere:
 
     def messages(self) -> list[str]:
         """Return messages for the user about this capture."""
-        told = []
+        messages = []
         if not self.alike:
-            told.append(
+            messages.append(
                 "the points of this capture match the scene of the run hardly better than "
                 "after a random rotation: check the renders, and check that both show the "
                 "same place in the same coordinates"
             )
         if self.trained:
-            told.append(f"left out: {self.trained} views that the run was trained on")
-        return told
+            messages.append(f"left out: {self.trained} views that the run was trained on")
+        return messages
 
 
 def elsewhere(setup: Setup, path: Path) -> Elsewhere:
@@ -82,7 +82,7 @@ def elsewhere(setup: Setup, path: Path) -> Elsewhere:
     moved = [replace(view, camera=_moved(view.camera, other, frame)) for view in other.views]
     _check_place(setup.scene, points, centers_of(moved), path)
     trained = _are_trained(moved, setup.train_views)
-    views = tuple(view for view, known in zip(moved, trained, strict=True) if not known)
+    views = tuple(view for view, is_trained in zip(moved, trained, strict=True) if not is_trained)
     if not views:
         raise UserError(
             "there are no views to evaluate: the run was trained on all views of this scene",
@@ -96,11 +96,11 @@ def elsewhere(setup: Setup, path: Path) -> Elsewhere:
 
 def _reader(setup: Setup, path: Path) -> ComponentChoice:
     """Return the reader of the other scene: the run's own if it accepts the folder, else auto."""
-    own, scene = setup.config.reader, setup.config.scene
+    run_reader, scene = setup.config.reader, setup.config.scene
     if scene is not None and path.resolve() == Path(scene).resolve():
-        return own
-    fits = own.name != AUTO and accepts(own.name, path)
-    return ComponentChoice(name=own.name if fits else AUTO)
+        return run_reader
+    fits = run_reader.name != AUTO and accepts(run_reader.name, path)
+    return ComponentChoice(name=run_reader.name if fits else AUTO)
 
 
 def _moved(camera: Camera, other: Scene, similarity: Similarity) -> Camera:
@@ -136,8 +136,11 @@ def _check_place(
     scene: Scene, points: NDArray[np.float64], centers: NDArray[np.float64], path: Path
 ) -> None:
     """Refuse a capture in other coordinates: its points are not where the run's scene is."""
-    own = np.concatenate([scene.points, scene.robust_centers])
-    middle, half = (own.max(axis=0) + own.min(axis=0)) / 2, np.ptp(own, axis=0) / 2
+    scene_points = np.concatenate([scene.points, scene.robust_centers])
+    middle, half = (
+        (scene_points.max(axis=0) + scene_points.min(axis=0)) / 2,
+        np.ptp(scene_points, axis=0) / 2,
+    )
     what = points if len(points) else centers
     share = float(np.mean(np.all(np.abs(what - middle) <= MARGIN * half, axis=1)))
     if share < LEAST_SHARED:
@@ -150,7 +153,7 @@ def _check_place(
         )
 
 
-def _alike(own: NDArray[np.float64], points: NDArray[np.float64]) -> bool:
+def _alike(run_points: NDArray[np.float64], points: NDArray[np.float64]) -> bool:
     """Return True if `points` are near the run's points, and would not be after a rotation.
 
     Also return True if there are too few points for a decision.
@@ -159,19 +162,23 @@ def _alike(own: NDArray[np.float64], points: NDArray[np.float64]) -> bool:
 
     # Ignore points outside the box of the run's points, because the other capture may show a larger
     # area.
-    points = points[((points >= own.min(axis=0)) & (points <= own.max(axis=0))).all(axis=1)]
-    if min(len(own), len(points)) < FEWEST_POINTS:
+    points = points[
+        ((points >= run_points.min(axis=0)) & (points <= run_points.max(axis=0))).all(axis=1)
+    ]
+    if min(len(run_points), len(points)) < FEWEST_POINTS:
         return True
-    tree = cKDTree(_some(own, MOST_OWN))
-    some = _some(points, MOST_POINTS)
-    middle = np.median(some, axis=0)
+    tree = cKDTree(_some(run_points, MOST_OWN))
+    sample = _some(points, MOST_POINTS)
+    middle = np.median(sample, axis=0)
     turns = torch.randn(TURNS, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
 
     def away(where: NDArray[np.float64]) -> float:
         return float(np.median(tree.query(where)[0]))
 
-    turned = [(some - middle) @ each.T + middle for each in rotation_matrices(turns).numpy()]
-    return away(some) <= LEAST_ALIKE * min(map(away, turned))
+    turned = [
+        (sample - middle) @ rotation.T + middle for rotation in rotation_matrices(turns).numpy()
+    ]
+    return away(sample) <= LEAST_ALIKE * min(map(away, turned))
 
 
 def _some(points: NDArray[np.float64], most: int) -> NDArray[np.float64]:

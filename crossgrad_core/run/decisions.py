@@ -134,7 +134,7 @@ def redecided(setup: Setup, planned: int, start: int | None = None) -> Setup:
         planned: Number of steps that the run is now planned with.
         start: Primitives at the start; None before they are counted.
     """
-    numbers = {each.name for each in fields(Numbers)}
+    numbers = {field.name for field in fields(Numbers)}
     rows = {row.setting: row for row in setup.decide(Length(planned, planned, start))}
     table = {row.setting: row for row in setup.decisions}
     changed = {

@@ -101,7 +101,7 @@ def _rasterizer(config: RunConfig) -> tuple[str, str]:
         return name, named.missing("cuda") if runs else f"rasterizer {name} does not run on it"
     on_cpu = max(speeds_on("cpu")[0].values(), default=0.0)
     speeds, notes = speeds_on("cuda")
-    faster = {each: speed for each, speed in speeds.items() if speed > on_cpu}
+    faster = {rasterizer: speed for rasterizer, speed in speeds.items() if speed > on_cpu}
     able = fastest_able(faster, demands(config, "cuda", *_trained(config)), notes)
     if able is not None:
         return able, ""
@@ -118,13 +118,13 @@ def _trained(config: RunConfig) -> tuple[Backbone, Densifier]:
 
 def _missing() -> list[str]:
     """Return what each installed rasterizer needs to run on the GPU, and how to install it."""
-    told = []
+    requirements = []
     for name in entries("rasterizers"):
         try:
-            told.append(load(Rasterizer, name).missing("cuda"))
+            requirements.append(load(Rasterizer, name).missing("cuda"))
         except UserError:  # Another note already reports that the package cannot be imported.
             continue
-    return told
+    return requirements
 
 
 def _failure(config: RunConfig, name: str) -> str:

@@ -58,8 +58,8 @@ class Exported:
 
     def as_data(self) -> dict[str, Json]:
         """Return the values for summary.json."""
-        told = {name: value for name, value in vars(self).items() if name != "notes"}
-        return {**told, "loss": self.loss}
+        values = {name: value for name, value in vars(self).items() if name != "notes"}
+        return {**values, "loss": self.loss}
 
 
 def export_scene(
@@ -89,7 +89,7 @@ def export_scene(
     view = None if camera is None else view_named(setup, camera)
     views = setup.train_views if view is None else (view,)
     with torch.no_grad():
-        cameras = [each.camera for each in views]
+        cameras = [baked_view.camera for baked_view in views]
         baked = setup.backbone.bake(eval_parameters(setup, state), phase, cameras)
     exporter = exporter or setup.selection.exporter
     placed = setup.scene.georeference.placed(baked, setup.scene.similarity, coordinates)
@@ -126,8 +126,11 @@ def _write_georef(path: Path, placed: Placed, exporter: Exporter) -> tuple[str, 
         return ()
     facts = {"coordinates": INPUT, **placed.facts, "offset": offset, "rounding": largest}
     write_atomically(georef_of(path), f"{dumps({'file': path.name, **facts}, indent=1)}\n".encode())
-    told = f"; rounding moves Gaussians by at most {largest:.1g} units" if largest else ""
-    return (f"{path.name}: {facts['coordinates']} coordinates, see {georef_of(path).name}{told}",)
+    rounding_note = f"; rounding moves Gaussians by at most {largest:.1g} units" if largest else ""
+    return (
+        f"{path.name}: {facts['coordinates']} coordinates, "
+        f"see {georef_of(path).name}{rounding_note}",
+    )
 
 
 def _own_background(setup: Setup) -> str | None:
@@ -137,13 +140,13 @@ def _own_background(setup: Setup) -> str | None:
 
 def _mean_psnr(views: Sequence[View], render_one: Callable[[View], Tensor]) -> float | None:
     """Return the mean PSNR in dB over the views with pixels to compare; None without such views."""
-    each = []
+    values = []
     with torch.no_grad():
         for view in views:
             pair = compare(view, render_one(view))
-            each.append(psnr(pair.render, pair.photo, pair.mask))
-    known = [value for value in each if value is not None]
-    return fsum(known) / len(known) if known else None
+            values.append(psnr(pair.render, pair.photo, pair.mask))
+    numbers = [value for value in values if value is not None]
+    return fsum(numbers) / len(numbers) if numbers else None
 
 
 def view_named(setup: Setup, name: str, where: str = "--camera") -> View:

@@ -193,12 +193,12 @@ class RunLoop:
         for missing, write in parts:
             self._attempt(missing, partial(self._unless_interrupted, write))
 
-    def _unless_interrupted(self, part: Callable[[], _T]) -> _T:
+    def _unless_interrupted(self, action: Callable[[], _T]) -> _T:
         with self.stopper.interruptible():
             if self.stopper.at_once:
                 raise KeyboardInterrupt
             try:
-                return part()
+                return action()
             except Exception as error:
                 # Compiled code can replace an interrupt by its own error.
                 if self.stopper.at_once:
@@ -212,15 +212,15 @@ class RunLoop:
             lambda: self.session.summarise(self.setup, self.state, ending.status, ending.error),
         )
 
-    def _attempt(self, missing: str, part: Callable[[], None]) -> None:
+    def _attempt(self, missing: str, action: Callable[[], None]) -> None:
         """Execute a part of the run; record a failure of the part in the ending.
 
         Args:
             missing: The result that is missing if the part fails.
-            part: The function that executes the part.
+            action: The function that executes the part.
         """
         try:
-            part()
+            action()
         except KeyboardInterrupt:
             if self.ending.error is None:
                 self.ending = replace(self.ending, status="stopped")
@@ -231,12 +231,15 @@ class RunLoop:
         reason, traced = reason_of(error), is_unexpected(error)
         if traced:
             self.log.write(traceback_of(error))
-        known = self.ending.error
-        if known is None or reason not in known:
-            parts = [known, ": ".join(part for part in (missing, *notes_on(error), reason) if part)]
-            known = "\n".join(part for part in parts if part)
+        message = self.ending.error
+        if message is None or reason not in message:
+            parts = [
+                message,
+                ": ".join(part for part in (missing, *notes_on(error), reason) if part),
+            ]
+            message = "\n".join(part for part in parts if part)
         before = self.ending
-        self.ending = Ending("failed", known, before.traced or traced, before.cause or error)
+        self.ending = Ending("failed", message, before.traced or traced, before.cause or error)
 
     def _info(self) -> RunInfo:
         setup = self.setup
@@ -347,14 +350,14 @@ class Forecast:
     def _tell(self, setup: Setup, state: TrainState) -> None:
         self._told = True
         step, seconds = self._first or (0, 0.0)
-        each = (state.clock.train - seconds) / (state.step - step)
-        ahead = seconds_ahead(setup, state, each)
+        seconds_per_step = (state.clock.train - seconds) / (state.step - step)
+        ahead = seconds_ahead(setup, state, seconds_per_step)
         if ahead < WORTH_A_LINE:
             return
         left = setup.schedule.total - state.step
-        growth = ", including growth" if ahead > left * each else ""
+        growth = ", including growth" if ahead > left * seconds_per_step else ""
         setup.hook.crossgrad_log(
             text=f"the remaining {left:,} steps take {roughly(ahead)} (one step takes "
-            f"{each * 1000:.0f} ms now{growth}); --seconds S sets a time limit instead, "
-            "and Ctrl-C stops the run and keeps the results so far"
+            f"{seconds_per_step * 1000:.0f} ms now{growth}); --seconds S sets a time limit "
+            "instead, and Ctrl-C stops the run and keeps the results so far"
         )

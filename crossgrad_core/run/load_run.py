@@ -106,7 +106,7 @@ def settings_of(config: RunConfig) -> dict[str, Json]:
     flat: dict[str, Json] = {"crossgrad": VERSION}
     for key, value in data.items():
         inner = value.items() if isinstance(value, dict) else ()
-        flat |= {f"{key}.{name}": each for name, each in inner} or {key: value}
+        flat |= {f"{key}.{name}": option for name, option in inner} or {key: value}
     return {**flat, _TIMED: config.planned_seconds is not None}
 
 
@@ -170,8 +170,8 @@ def check_settings(config: RunConfig, checkpoint: Checkpoint) -> None:
     ours = settings_of(config)
     # A setting that did not exist when the checkpoint was written is not a change. A new option of
     # a component may be a change.
-    known = {key.partition(".")[0] for key in stored}
-    both = {key for key in ours.keys() | stored.keys() if key.partition(".")[0] in known}
+    known_components = {key.partition(".")[0] for key in stored}
+    both = {key for key in ours.keys() | stored.keys() if key.partition(".")[0] in known_components}
     # Another rasterizer has other options. A length that follows a time budget lacks these
     # settings.
     either = {_DRAWN, "steps", "revisions", "revised"}
@@ -300,17 +300,19 @@ def without_missing(config: RunConfig) -> RunConfig:
     lacking = []
     for slot, plain in _PLAIN.items():
         chosen = config.operators if slot == "operator" else (getattr(config, slot),)
-        if gone := [each.name for each in chosen if each is not None and _is_gone(slot, each)]:
+        if gone := [
+            choice.name for choice in chosen if choice is not None and _is_gone(slot, choice)
+        ]:
             lacking.append(f"{slot} {listed(gone)}")
             update[slot] = ComponentChoice(name=plain)
     for slot in LISTS:
-        known, chosen = entries(slot), getattr(config, slot)
-        if gone := [each.name for each in chosen if each.name not in known]:
+        installed, chosen = entries(slot), getattr(config, slot)
+        if gone := [choice.name for choice in chosen if choice.name not in installed]:
             lacking.append(f"{slot} {listed(gone)}")
-            update[slot] = tuple(each for each in chosen if each.name in known)
+            update[slot] = tuple(choice for choice in chosen if choice.name in installed)
     if gone := sorted(config.rules.keys() - entries("rules").keys()):
         lacking.append(f"rules {listed(gone)}")
-        update["rules"] = {n: each for n, each in config.rules.items() if n not in gone}
+        update["rules"] = {n: options for n, options in config.rules.items() if n not in gone}
     if lacking:
         _LOG.warning("not installed here, so they are not used: %s", listed(lacking))
     return config.model_copy(update=update)

@@ -40,9 +40,9 @@ class Option:
 
 def _options(model: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[Option]:
     for name, field in model.model_fields.items():
-        for each in field.metadata:
-            if isinstance(each, Flag):
-                yield Option((*path, name), each, _kind(field), field.description or "")
+        for flag in field.metadata:
+            if isinstance(flag, Flag):
+                yield Option((*path, name), flag, _kind(field), field.description or "")
         inner = field.annotation
         if isinstance(inner, type) and issubclass(inner, BaseModel):
             yield from _options(inner, (*path, name))
@@ -51,7 +51,7 @@ def _options(model: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[Opt
 def _kind(field: FieldInfo) -> object:
     if get_origin(field.annotation) in {tuple, dict}:
         return list[str]
-    kinds = [each for each in get_args(field.annotation) if each is not NoneType]
+    kinds = [argument for argument in get_args(field.annotation) if argument is not NoneType]
     kind = kinds[0] if len(kinds) == 1 else field.annotation
     return kind if kind in _OWN_TYPES else str
 

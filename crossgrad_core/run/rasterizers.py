@@ -123,7 +123,9 @@ def drawn_elsewhere(config: RunConfig) -> RunConfig:
     others, _ = speeds_on(device)
     if not others:
         return config
-    shared = set.intersection(*(set(load(Rasterizer, each).model_fields) for each in others))
+    shared = set.intersection(
+        *(set(load(Rasterizer, rasterizer).model_fields) for rasterizer in others)
+    )
     kept = {key: value for key, value in config.rasterizer.options.items() if key in shared}
     _LOG.warning("rasterizer %s does not run on %s: another rasterizer is used", name, device)
     choice = ComponentChoice.model_validate({"name": AUTO, **kept})

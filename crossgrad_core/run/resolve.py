@@ -32,18 +32,18 @@ def resolved(setup: Setup) -> RunConfig:
         "points": _located(data.points),
         "masks": _located(data.masks),
     }
-    known = config.exposure_from
+    exposure_run = config.exposure_from
     return config.model_copy(
         update={
             **chosen,
             "operator": _operator(config, setup),
             "reader": config.reader.model_copy(update={"name": names["reader"]}),
-            "metrics": tuple(_choice(name, each) for name, each in selection.metrics.items()),
+            "metrics": tuple(_choice(name, metric) for name, metric in selection.metrics.items()),
             "observers": tuple(c for c in config.observers if c.name != PROGRESS),
             "rules": {name: _options(selection.rules.get(name)) for name in config.rules},
             "scene": scene,
             "data": data.model_copy(update=located),
-            "exposure_from": None if known is None else known.resolve(),
+            "exposure_from": None if exposure_run is None else exposure_run.resolve(),
             "out": None,
             "views_per_step": selection.views.setting,
             "steps": None if config.seconds else config.steps or setup.schedule.total,

@@ -104,7 +104,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
 
 def rules_of(config: RunConfig) -> dict[str, Rule]:
     """Return the rules of a run by name."""
-    return {each.name: build(Rule, each.name, each.options) for each in config.used_rules}
+    return {rule.name: build(Rule, rule.name, rule.options) for rule in config.used_rules}
 
 
 def _require_points(config: RunConfig, scene: Scene, start: Initializer) -> None:
@@ -144,7 +144,7 @@ def _require_shown_points(config: RunConfig, scene: Scene, start: Initializer) -
 def _require_decided_options(config: RunConfig, name: str) -> None:
     """Refuse a rasterizer that lacks an option which the recipe sets."""
     lacking = config.rasterizer.options.keys() - load(Rasterizer, name).model_fields.keys()
-    if decided := sorted(each for each in lacking if f"rasterizer.{each}" in config.decided):
+    if decided := sorted(option for option in lacking if f"rasterizer.{option}" in config.decided):
         raise UserError(
             f"rasterizer {name} has no option {listed(decided)}, which the recipe sets",
             where=f"--recipe {config.recipe.name}",
@@ -178,11 +178,11 @@ def _metrics(config: RunConfig, scene: Scene, notes: list[str]) -> dict[str, Met
     """
     metrics: dict[str, Metric] = {}
     regimes = sorted({view.regime for view in scene.test_views})
-    for name, choice in {each.name: each for each in config.metrics}.items():
+    for name, choice in {choice.name: choice for choice in config.metrics}.items():
         metric = chosen(Metric, choice)
         _check_form(name, metric.described().form)
-        columns = columns_for(regimes, [each.figure for each in (*metrics.values(), metric)])
-        twice = sorted({each for each in columns if columns.count(each) > 1})
+        columns = columns_for(regimes, [counted.figure for counted in (*metrics.values(), metric)])
+        twice = sorted({column for column in columns if columns.count(column) > 1})
         if not twice:
             metrics[name] = metric
         elif name in METRICS.split("+"):
@@ -257,16 +257,16 @@ def views_per_step_of(config: RunConfig) -> tuple[ViewsPerStepSpec, str]:
         return config.view_plan, ""
     sampler = build(Sampler, config.sampler.name, config.sampler.options)
     operator, _ = operator_of(config)
-    usual = sampler.resolved_views
+    default_views = sampler.resolved_views
     of_sampler = (k for k in range(1, _MOST_VIEWS) if sampler.view_counts.admits(k))
     both = [k for k in of_sampler if operator.views.admits(k)]
     # A user who names no operator expects only the sum of the gradients.
     named = config.operator != RunConfig.model_fields["operator"].default
-    found, why = usual, ""
-    if usual not in both:
+    chosen_views, why = default_views, ""
+    if default_views not in both:
         # If no K suits both, the validation of the selection reports it.
-        found, why = next(iter(both), usual), f"the operator needs {operator.views}"
-    elif named and operator.needs_more_views(usual):
-        found = next((k for k in both if not operator.needs_more_views(k)), usual)
+        chosen_views, why = next(iter(both), default_views), f"the operator needs {operator.views}"
+    elif named and operator.needs_more_views(default_views):
+        chosen_views = next((k for k in both if not operator.needs_more_views(k)), default_views)
         why = "with fewer views the operator has no effect"
-    return ViewsPerStepSpec((found,)), why if found != usual else ""
+    return ViewsPerStepSpec((chosen_views,)), why if chosen_views != default_views else ""

@@ -83,7 +83,10 @@ def name_file(
         assignments: The assignments, as given to `merged`.
     """
     key = error.where.removeprefix("--").split(".")[0].replace("-", "_")
-    beside = {path[0] for path in [*_places(options), *(_parsed(each)[0] for each in assignments)]}
+    beside = {
+        path[0]
+        for path in [*_places(options), *(_parsed(assignment)[0] for assignment in assignments)]
+    }
     if key in _of_file(config) and key not in beside:
         error.where = f"{error.where.removeprefix('--')} in {config}"
         error.args = (error.message(),)
@@ -145,7 +148,7 @@ def _flat(layer: Mapping[str, object]) -> Settings:
     flat: Settings = {}
     for name, value in layer.items():
         if name in GROUPS_OF_SETTINGS and isinstance(value, dict):
-            flat |= {f"{name}.{inner}": each for inner, each in value.items()}
+            flat |= {f"{name}.{inner}": setting for inner, setting in value.items()}
         else:
             flat[name] = value
     return flat
@@ -160,12 +163,13 @@ def _places(options: Mapping[str, object]) -> dict[tuple[str, ...], object]:
     places: dict[tuple[str, ...], object] = {}
     for name, value in options.items():
         if not (value is None or (isinstance(value, list) and not value)):
-            place = _PLACES.get(name, tuple(name.split(".")))
-            if place == (RULES,):
+            path = _PLACES.get(name, tuple(name.split(".")))
+            if path == (RULES,):
                 rules: dict[tuple[str, ...], object] = {
-                    (RULES, rule): each for rule, each in _rules(name, value).items()
+                    (RULES, rule): rule_options
+                    for rule, rule_options in _rules(name, value).items()
                 }
-                if twice := [place[-1] for place in places.keys() & rules.keys()]:
+                if twice := [path[-1] for path in places.keys() & rules.keys()]:
                     raise UserError(
                         "the same rule is added and removed",
                         where="--rule, --no-rule",
@@ -174,7 +178,7 @@ def _places(options: Mapping[str, object]) -> dict[tuple[str, ...], object]:
                     )
                 places |= rules
             else:
-                places[place] = _plain(value)
+                places[path] = _plain(value)
     return places
 
 
@@ -185,21 +189,21 @@ def _rules(option: str, value: object) -> Mapping[str, object]:
         UserError: A value is not a rule.
     """
     if isinstance(value, Mapping) and "name" not in value:
-        return {str(name): _plain(each) for name, each in value.items()}
-    found: dict[str, object] = {}
-    for each in _items(value):
-        choice = _named(RULES, each)
+        return {str(name): _plain(options) for name, options in value.items()}
+    options_by_rule: dict[str, object] = {}
+    for item in _items(value):
+        choice = _named(RULES, item)
         if not isinstance(choice, dict) or not isinstance(choice.get("name"), str):
             raise UserError(
                 "the list of rules contains an entry that is not a rule",
                 where=RULES,
                 expected="names of rules, or a mapping of names to options",
-                found=repr(each),
+                found=repr(item),
                 todo="`crossgrad plugins list --slot rules` shows all rules",
             )
-        options = {key: each for key, each in choice.items() if key != "name"}
-        found[choice["name"]] = option != "no_rule" and (options or True)
-    return found
+        options = {key: setting for key, setting in choice.items() if key != "name"}
+        options_by_rule[choice["name"]] = option != "no_rule" and (options or True)
+    return options_by_rule
 
 
 def _overlaid(
@@ -219,7 +223,7 @@ def _overlaid(
     settings = _opened(settings, [*chosen, *(path for path, _ in assigned)])
     # Set names first, because a new component drops the options of the previous component.
     for given in (list(chosen.items()), assigned):
-        for path, value in sorted(given, key=lambda each: not _is_name(each[0])):
+        for path, value in sorted(given, key=lambda pair: not _is_name(pair[0])):
             _assign(settings, path, value)
     return settings
 
@@ -265,14 +269,14 @@ def _long_form(key: str, value: object) -> object:
     if key in CHOICES and value is not None:
         return _choice(key, value)
     if key in LISTS and value is not None:
-        return [_named(key, each) for each in _items(value)]
+        return [_named(key, item) for item in _items(value)]
     return value
 
 
 def _choice(key: str, value: object) -> object:
     """Return one choice for `a`; a list of choices for `a+b` or a list."""
     chain = isinstance(value, list | tuple) or (isinstance(value, str) and "+" in value)
-    return [_named(key, each) for each in _items(value)] if chain else _named(key, value)
+    return [_named(key, item) for item in _items(value)] if chain else _named(key, value)
 
 
 def _items(value: object) -> Iterable[object]:
@@ -340,7 +344,7 @@ def _plain(value: object) -> object:
         case Path():
             return str(value)
         case Mapping():
-            return {name: _plain(each) for name, each in value.items()}
+            return {name: _plain(item) for name, item in value.items()}
         case list() | tuple():
             return type(value)(map(_plain, value))
     to_python = getattr(value, "item", None)
@@ -407,14 +411,14 @@ def _in_list(value: object) -> list[object]:
 
 def _links(value: object) -> list[Settings]:
     """Return the choices in a setting: one component, a chain, or observers."""
-    return [each for each in _in_list(value) if isinstance(each, dict)]
+    return [choice for choice in _in_list(value) if isinstance(choice, dict)]
 
 
 def _renamed(old: object, new: object) -> object:
     """Return the new choice; a link with the same name as before keeps its options."""
     renamed = [
-        _with_options(_links(old), each) if isinstance(each, dict) else each
-        for each in _in_list(new)
+        _with_options(_links(old), choice) if isinstance(choice, dict) else choice
+        for choice in _in_list(new)
     ]
     return renamed if isinstance(new, list) else renamed[0]
 
@@ -433,7 +437,7 @@ def _extended(old: list[object], new: object) -> list[object]:
     Values that are not choices, and new names that occur twice, are left for the validation.
     """
     extended, names = list(old), [link.get("name") for link in _links(new)]
-    named = [(row, each) for row, each in enumerate(old) if isinstance(each, dict)]
+    named = [(row, link) for row, link in enumerate(old) if isinstance(link, dict)]
     for choice in _in_list(new):
         options: Settings = choice if isinstance(choice, dict) else {}
         name = options.get("name")
@@ -448,32 +452,32 @@ def _extended(old: list[object], new: object) -> list[object]:
 
 def _holder(settings: Settings, path: tuple[str, ...]) -> Settings:
     """Return the dictionary that holds the last part of a path; create it if it is missing."""
-    place: object = settings
+    holder: object = settings
     for depth in range(len(path) - 1):
-        place = _inner(place, path, depth)
-    match place:
+        holder = _inner(holder, path, depth)
+    match holder:
         case dict():
-            return place
+            return holder
         case list():
-            raise _whose(place, path)
+            raise _whose(holder, path)
         case _:
             raise _no_options(path, len(path) - 1)
 
 
-def _inner(place: object, path: tuple[str, ...], depth: int) -> object:
+def _inner(holder: object, path: tuple[str, ...], depth: int) -> object:
     """Return the value that `path[depth]` names inside a value."""
     part = path[depth]
-    match place:
+    match holder:
         case dict():
-            left_out = path[0] == RULES and depth and place.get(part) in (True, False)
-            if place.get(part) is None or left_out:
-                place[part] = {}
-            return place[part]
+            left_out = path[0] == RULES and depth and holder.get(part) in (True, False)
+            if holder.get(part) is None or left_out:
+                holder[part] = {}
+            return holder[part]
         case list():
-            for link in _links(place):
+            for link in _links(holder):
                 if link.get("name") == part:
                     return link
-            raise _whose(place, path)
+            raise _whose(holder, path)
         case _:
             raise _no_options(path, depth)
 

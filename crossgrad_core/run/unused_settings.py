@@ -50,7 +50,7 @@ def refuse_settings_for_nothing(config: RunConfig, setup: Setup) -> None:
     Raises:
         UserError: A setting would change nothing.
     """
-    found = [
+    ineffective = [
         *_of_components(config, setup),
         *_of_density_control(config, setup),
         *_of_resets(config, setup),
@@ -63,11 +63,11 @@ def refuse_settings_for_nothing(config: RunConfig, setup: Setup) -> None:
         *_of_the_start(config),
         *_of_rules(config, setup),
     ]
-    if found:
+    if ineffective:
         raise UserError(
             "some settings would have no effect",
-            where=listed(name for name, _ in found),
-            found="; ".join(f"{name}: {why}" for name, why in found),
+            where=listed(name for name, _ in ineffective),
+            found="; ".join(f"{name}: {why}" for name, why in ineffective),
             todo="leave them out, or change the setting that makes them ineffective",
         )
 
@@ -78,12 +78,12 @@ def _of_components(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]
     links = config.operators
     for link in links:
         # Options of an operator in a chain are set by the name of the operator.
-        place = "operator" if len(links) == 1 else f"operator.{link.name}"
-        yield from _of_choice("operator", place, link, setup)
+        setting = "operator" if len(links) == 1 else f"operator.{link.name}"
+        yield from _of_choice("operator", setting, link, setup)
 
 
 def _of_choice(
-    slot: str, place: str, choice: ComponentChoice | None, setup: Setup
+    slot: str, setting: str, choice: ComponentChoice | None, setup: Setup
 ) -> Iterator[tuple[str, str]]:
     if choice is None or not choice.options:
         return
@@ -92,7 +92,7 @@ def _of_choice(
     # unneeded options.
     component = build(plural(slot), name, choice.options)
     for option, why in set_for_nothing(component, setup.selection).items():
-        yield f"{place}.{option}", why
+        yield f"{setting}.{option}", why
 
 
 def _of_density_control(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:

@@ -54,8 +54,8 @@ def without_blank_photos(split: Split, sources: Mapping[str, PhotoSource], root:
     """
     doubtful = [name for name in split.train if _can_be_blank(sources[name])]
     with ThreadPoolExecutor() as pool:
-        found = list(pool.map(_is_blank, [sources[name] for name in doubtful]))
-    blank = [name for name, is_blank in zip(doubtful, found, strict=True) if is_blank]
+        are_blank = list(pool.map(_is_blank, [sources[name] for name in doubtful]))
+    blank = [name for name, is_blank in zip(doubtful, are_blank, strict=True) if is_blank]
     if not blank:
         return split
     if len(blank) == len(split.train):
@@ -187,14 +187,14 @@ def label_by_footprint(
     footprints = np.array(
         [footprint(camera, points, rows) for camera, rows in zip(cameras, seen, strict=True)]
     )
-    known = np.isfinite(footprints)
-    trained = footprints[[i for i in train if known[i]]]
+    has_footprint = np.isfinite(footprints)
+    trained = footprints[[i for i in train if has_footprint[i]]]
     if not len(trained):
         return (_ONLY,) * len(cameras)
     centers = np.stack([camera.center.numpy() for camera in cameras])
-    for i in np.flatnonzero(~known):
-        distance = np.linalg.norm(centers[known] - centers[i], axis=1)
-        footprints[i] = footprints[known][distance.argmin()]
+    for i in np.flatnonzero(~has_footprint):
+        distance = np.linalg.norm(centers[has_footprint] - centers[i], axis=1)
+        footprints[i] = footprints[has_footprint][distance.argmin()]
     threshold = np.median(trained)
     return tuple(NEAR if value >= threshold else FAR for value in footprints)
 

@@ -219,18 +219,18 @@ def differences(was: Fingerprint, now: Fingerprint) -> list[Difference]:
     A change of the training views also changes the local frame and all values measured in it. In
     this case only the change of the views is reported.
     """
-    found = _views(was, now)
-    if not any(each.weight is Weight.PLACE for each in found):
-        found += _frame(was, now) or [*_cameras(was, now), *_points(was, now)]
-    found += _files(was, now)
+    changes = _views(was, now)
+    if not any(change.weight is Weight.PLACE for change in changes):
+        changes += _frame(was, now) or [*_cameras(was, now), *_points(was, now)]
+    changes += _files(was, now)
     # If a difference was found, it is listed, and other changed files are not reported in addition.
-    return found or _others(was, now)
+    return changes or _others(was, now)
 
 
 def _views(was: Fingerprint, now: Fingerprint) -> list[Difference]:
     trained, tested = _split(was)
     trains, tests = _split(now)
-    found = [
+    changes = [
         *_named(Weight.PLACE, "training photos missing", trained - trains - tests),
         *_named(Weight.PLACE, "new training photos", trains - trained - tested),
         *_named(
@@ -242,11 +242,11 @@ def _views(was: Fingerprint, now: Fingerprint) -> list[Difference]:
         *_named(Weight.HELD_OUT, "held-out photos missing", tested - trains - tests),
         *_named(Weight.HELD_OUT, "new held-out photos", tests - trained - tested),
     ]
-    if found and was.lists != now.lists:
+    if changes and was.lists != now.lists:
         names = {name for name, _ in was.lists.items() ^ now.lists.items()}
-        weight = max(each.weight for each in found)
-        found.append(Difference(weight, f"{' and '.join(sorted(names))} changed"))
-    return found
+        weight = max(change.weight for change in changes)
+        changes.append(Difference(weight, f"{' and '.join(sorted(names))} changed"))
+    return changes
 
 
 def _split(of: Fingerprint) -> tuple[set[str], set[str]]:

@@ -199,8 +199,12 @@ def _seen(
     for side, end in zip((-1.0, 1.0), ends, strict=True):
         seen += float(degrees[max(end, 0)])
         if end == steps - 1:
-            place = fit(side * farther)
-            goes_on = (side * np.diff(place) > 0.0) & (place[1:] >= 0.0) & (place[1:] <= size)
+            pixel_positions = fit(side * farther)
+            goes_on = (
+                (side * np.diff(pixel_positions) > 0.0)
+                & (pixel_positions[1:] >= 0.0)
+                & (pixel_positions[1:] <= size)
+            )
             steps_on = len(goes_on) if goes_on.all() else int(np.argmin(goes_on))
             seen += float(steps_on * degrees[1])
     return seen

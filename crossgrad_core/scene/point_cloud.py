@@ -149,13 +149,13 @@ def read_las(path: Path) -> dict[str, NDArray[np.generic]]:
             found=str(error) or type(error).__name__,
             todo="export the points again, or convert them to PLY",
         ) from error
-    found = sum(count for count, _ in rows)
-    if found < expected:
+    points_read = sum(count for count, _ in rows)
+    if points_read < expected:
         raise UserError(
             "the LAS file is incomplete: its end is missing",
             where=path,
             expected=f"{expected:,} points",
-            found=f"{found:,} points",
+            found=f"{points_read:,} points",
             todo="copy or export the file again",
         )
     tables = [table for _, table in rows]
@@ -167,16 +167,16 @@ def _rows(reader: "laspy.LasReader") -> Iterator[tuple[int, NDArray[np.float64]]
     """Yield for each part of the file its number of points and the kept rows [n, 3 or 6]."""
     names, start = _names(reader), 0
     stride = -(-reader.header.point_count // _MOST_IN_LAS) or 1
-    for part in reader.chunk_iterator(_AT_ONCE):
+    for chunk in reader.chunk_iterator(_AT_ONCE):
         kept = slice(-start % stride, None, stride)
-        columns = [np.asarray(part[name], dtype=np.float64)[kept] for name in names]
-        yield len(part), np.stack(columns, axis=1)
-        start += len(part)
+        columns = [np.asarray(chunk[name], dtype=np.float64)[kept] for name in names]
+        yield len(chunk), np.stack(columns, axis=1)
+        start += len(chunk)
 
 
 def _names(reader: "laspy.LasReader") -> tuple[str, ...]:
-    known = set(reader.header.point_format.dimension_names)
-    return ("x", "y", "z", *(_RGB if known.issuperset(_RGB) else ()))
+    dimensions = set(reader.header.point_format.dimension_names)
+    return ("x", "y", "z", *(_RGB if dimensions.issuperset(_RGB) else ()))
 
 
 def _require_laspy(path: Path) -> None:

@@ -87,8 +87,8 @@ def _by_regime(every: Split, names: Sequence[str], options: SceneOptions, label:
     gained = sorted(name for name, held_out in most.items() if few[name] < _FEWEST <= held_out)
     if not gained:
         return every
-    found = ", ".join(f"{count(few[name], 'photo')} of {name}" for name in gained)
-    why = f"split: by regime, since 1 in {options.test_every} by name would hold out {found}"
+    counts = ", ".join(f"{count(few[name], 'photo')} of {name}" for name in gained)
+    why = f"split: by regime, since 1 in {options.test_every} by name would hold out {counts}"
     return replace(stratified, notes=(*stratified.notes, why))
 
 
@@ -143,7 +143,9 @@ def _split_by_lists(
             found=name_some(both),
             todo=f"remove each name from one of {TRAIN_LIST} and {TEST_LIST}",
         )
-    train, test = (tuple(name for name in sorted(names) if name in part) for part in listed)
+    train, test = (
+        tuple(name for name in sorted(names) if name in names_in_list) for names_in_list in listed
+    )
     if not train:
         raise _matches_nothing(
             "no listed view can be used for training", places[0], names, listed[0]
@@ -165,11 +167,11 @@ def _split_by_lists(
 
 
 def _matches_nothing(
-    what: str, place: Path, names: Sequence[str], listed: frozenset[str]
+    what: str, path: Path, names: Sequence[str], listed: frozenset[str]
 ) -> UserError:
     return UserError(
         what,
-        where=place,
+        where=path,
         expected=f"names of photos relative to the image folder, such as {min(names)}",
         found=name_some(sorted(listed)) if listed else "no name",
         todo="correct the lists, add the missing photos, or use --split every",
@@ -207,5 +209,5 @@ def _read_list(path: Path, views: Sequence[str]) -> frozenset[str] | None:
         ) from error
     cleaned = (line.strip().replace("\\", "/").removeprefix("./") for line in lines)
     names = [name for name in cleaned if name and not name.startswith("#")]
-    found = FileNames(views).pair(names).files
-    return frozenset(found.get(name, name) for name in names)
+    view_by_name = FileNames(views).pair(names).files
+    return frozenset(view_by_name.get(name, name) for name in names)

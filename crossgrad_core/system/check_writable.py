@@ -29,31 +29,31 @@ def check_folder(folder: Path, needed: int = 0) -> None:
     Raises:
         UserError: The folder cannot be used; the message states the reason and a remedy.
     """
-    place = folder.absolute()
-    while not os.path.lexists(place):
-        place = place.parent
-    _check_length(folder, place)
-    if not place.is_dir():
+    existing = folder.absolute()
+    while not os.path.lexists(existing):
+        existing = existing.parent
+    _check_length(folder, existing)
+    if not existing.is_dir():
         raise UserError(
             "the folder cannot be created",
             where=folder,
-            found=f"{place} is not a folder",
+            found=f"{existing} is not a folder",
             todo="choose another path, or remove the file",
         )
     try:
         # Permission bits are not reliable on network file systems; a test file is.
-        with disk_errors(folder), tempfile.TemporaryFile(dir=place) as probe:
+        with disk_errors(folder), tempfile.TemporaryFile(dir=existing) as probe:
             probe.write(b"crossgrad")
     except OSError as error:  # A special kind of error, as in /proc.
         raise read_only(folder) from error
-    if needed and free_bytes(place) < needed:
+    if needed and free_bytes(existing) < needed:
         raise disk_full(folder, needed)
 
 
-def _check_length(folder: Path, place: Path) -> None:
+def _check_length(folder: Path, existing: Path) -> None:
     """Refuse a folder whose path is too long for the paths of the files in it."""
     name, path = (
-        os.pathconf(place, limit) if hasattr(os, "pathconf") else default
+        os.pathconf(existing, limit) if hasattr(os, "pathconf") else default
         for limit, default in (("PC_NAME_MAX", 255), ("PC_PATH_MAX", 4096))
     )
     longest = max(len(os.fsencode(part)) for part in folder.absolute().parts)

@@ -80,8 +80,8 @@ def relisted(folder: Path, *names: str) -> Iterator[None]:
 def _digests(folder: Path, names: Iterable[str]) -> dict[str, str]:
     """Return the digests of files, and of all files in folders."""
     places = [folder / name for name in names]
-    found = [path for place in places for path in (place, *place.rglob("*")) if path.is_file()]
-    return {path.relative_to(folder).as_posix(): digest_of(path) for path in found}
+    files = [path for root in places for path in (root, *root.rglob("*")) if path.is_file()]
+    return {path.relative_to(folder).as_posix(): digest_of(path) for path in files}
 
 
 def read_checksums(folder: Path) -> dict[str, str]:
@@ -97,13 +97,13 @@ def read_checksums(folder: Path) -> dict[str, str]:
         return {}
     except OSError as error:
         raise _unreadable(path, error.strerror or str(error)) from error
-    found = {}
+    digest_by_name = {}
     for line in text.splitlines():
         match = _LINE.fullmatch(line)
         if match is None:
             raise _unreadable(path, one_line(line))
-        found[match[2]] = match[1]
-    return found
+        digest_by_name[match[2]] = match[1]
+    return digest_by_name
 
 
 def changed_files(folder: Path, names: Iterable[str] | None = None) -> list[str]:

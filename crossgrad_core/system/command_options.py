@@ -46,8 +46,8 @@ def option(
         flag: Name of the option, if it differs from the name of the field.
         **bounds: `min` and `max` of a number.
     """
-    known: dict[str, Any] = {"metavar": metavar, "rich_help_panel": heading, **bounds}
-    info = typer.Option(*([flag] if flag else []), help=help, **known)
+    arguments: dict[str, Any] = {"metavar": metavar, "rich_help_panel": heading, **bounds}
+    info = typer.Option(*([flag] if flag else []), help=help, **arguments)
     return field(default=default, metadata={_INFO: info})
 
 
@@ -63,12 +63,12 @@ def command_of(
     kinds = get_type_hints(options)
     parameters = [
         Parameter(
-            each.name,
+            member.name,
             Parameter.KEYWORD_ONLY,
-            default=Parameter.empty if each.default is MISSING else each.default,
-            annotation=Annotated[kinds[each.name], each.metadata[_INFO]],
+            default=Parameter.empty if member.default is MISSING else member.default,
+            annotation=Annotated[kinds[member.name], member.metadata[_INFO]],
         )
-        for each in fields(cast("Any", options))
+        for member in fields(cast("Any", options))
     ]
 
     def decorated(function: Callable[[_Given], None]) -> Callable[..., None]:
@@ -77,7 +77,7 @@ def command_of(
             function(options(**given))
 
         command.__dict__["__signature__"] = Signature(parameters)
-        command.__annotations__ = {each.name: each.annotation for each in parameters}
+        command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
         return command
 
     return decorated

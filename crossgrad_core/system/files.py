@@ -29,10 +29,10 @@ def size_text(count: int) -> str:
 
 def free_bytes(path: Path) -> int:
     """Return the free bytes of the file system of `path`, which need not exist yet."""
-    place = path.absolute()
-    while not os.path.exists(place):  # `Path.exists` raises an error for a long name.
-        place = place.parent
-    return shutil.disk_usage(place).free
+    existing = path.absolute()
+    while not os.path.exists(existing):  # `Path.exists` raises an error for a long name.
+        existing = existing.parent
+    return shutil.disk_usage(existing).free
 
 
 def disk_full(path: Path, needed: int | None) -> UserError:

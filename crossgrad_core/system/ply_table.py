@@ -115,8 +115,8 @@ def vertex_properties(path: Path) -> tuple[str, ...]:
     _require_file(path)
     with open_file(path) as file:
         elements = _read_header(file, path).elements
-    fields = (each.fields or () for each in elements if each.name == "vertex")
-    return tuple(name for each in fields for name, _ in each)
+    fields = (element.fields or () for element in elements if element.name == "vertex")
+    return tuple(name for vertex_fields in fields for name, _ in vertex_fields)
 
 
 def _require_file(path: Path) -> None:

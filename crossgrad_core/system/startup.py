@@ -41,7 +41,7 @@ def announce(*, quiet: bool = False) -> None:
 def finish() -> None:
     """End the reports that `announce` began, before a result or an error is shown."""
     logger = logging.getLogger(_PACKAGE)
-    for handler in [each for each in logger.handlers if isinstance(each, _Startup)]:
+    for handler in [handler for handler in logger.handlers if isinstance(handler, _Startup)]:
         handler.close()
         logger.removeHandler(handler)
         logger.setLevel(logging.NOTSET)

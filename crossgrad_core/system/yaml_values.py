@@ -147,7 +147,7 @@ def described(error: yaml.YAMLError) -> str:
     """Describe the fault in a YAML text in one line, with its position."""
     if not isinstance(error, yaml.MarkedYAMLError):
         return " ".join(str(error).split())
-    text = ", ".join(part for part in (error.context, error.problem) if part)
+    text = ", ".join(phrase for phrase in (error.context, error.problem) if phrase)
     mark = error.problem_mark or error.context_mark
     return f"{text} (line {mark.line + 1}, column {mark.column + 1})" if mark else text
 

@@ -61,15 +61,15 @@ def blocks_cover_the_parameters(make: Make[Backbone]) -> None:
         single = len(block.tensors) > 1 or block.tensors[0] == block.name
         require(single, f"the single-tensor block {block.name} must have the name of its tensor")
         for name in block.tensors if block.per_primitive else ():
-            found = parameters[name].shape[0]
-            require(found == rows, f"{name} has {found} rows for {rows} Gaussians")
+            row_count = parameters[name].shape[0]
+            require(row_count == rows, f"{name} has {row_count} rows for {rows} Gaussians")
 
 
 def the_default_densifier_is_there(make: Make[Backbone]) -> None:
     """`default_densifier` names an installed densifier whose tensors are in the blocks."""
     backbone = make()
-    usual = registry.load(Densifier, backbone.default_densifier)
-    lacks = usual.tensors - {name for block in backbone.blocks() for name in block.tensors}
+    densifier = registry.load(Densifier, backbone.default_densifier)
+    lacks = densifier.tensors - {name for block in backbone.blocks() for name in block.tensors}
     what = f"default_densifier: {backbone.default_densifier}"
     require(not lacks, f"{what} needs the tensors {listed(sorted(lacks))}, which no block contains")
 
@@ -136,8 +136,10 @@ def positions_are_those_of_primitives(make: Make[Backbone]) -> None:
     parameters = created(backbone)
     held = [name for block in backbone.blocks() if block.per_primitive for name in block.tensors]
     fitting = [name for name in held if parameters[name].shape[1:] == (3,)]
-    known = f"positions is {backbone.positions!r}; tensors [N, 3] of primitives: {listed(fitting)}"
-    require(backbone.positions in {"", *fitting}, known)
+    message = (
+        f"positions is {backbone.positions!r}; tensors [N, 3] of primitives: {listed(fitting)}"
+    )
+    require(backbone.positions in {"", *fitting}, message)
 
 
 def axes_are_those_of_primitives(make: Make[Backbone]) -> None:
@@ -260,7 +262,8 @@ def plain_ones_bake_what_they_draw(make: Make[Backbone]) -> None:
         with torch.no_grad():
             decoded = backbone.decode(parameters, camera, phase)
             drawn, again = (
-                rasterizer.render(each, camera, background).image for each in (decoded, baked)
+                rasterizer.render(gaussians, camera, background).image
+                for gaussians in (decoded, baked)
             )
         error = (drawn - again).abs()
         require(
@@ -284,15 +287,18 @@ def _grown(parameters: Parameters) -> Parameters:
         step = torch.from_numpy(rng.uniform(0.0, _STEP, tuple(tensor.shape))).to(tensor)
         return (tensor.detach() + step).requires_grad_()
 
-    return {name: grown(each) if each.requires_grad else each for name, each in parameters.items()}
+    return {
+        name: grown(parameter) if parameter.requires_grad else parameter
+        for name, parameter in parameters.items()
+    }
 
 
 def fitting_respects_the_user(make: Make[Backbone]) -> None:
     """`fitted_to` reports the options that it changed, and keeps every option set by the user."""
     backbone = make()
     fitted, notes = backbone.fitted_to(sample_scene())
-    told = fitted == backbone or len(notes) > 0
-    require(told, "fitted_to() changes options but returns no note about the change")
+    explained = fitted == backbone or len(notes) > 0
+    require(explained, "fitted_to() changes options but returns no note about the change")
     asked = type(backbone).model_validate(backbone.model_dump())
     require(
         asked.fitted_to(sample_scene())[0] == asked, "fitted_to() changes options that the user set"
@@ -312,8 +318,8 @@ def passed_on_tensors_are_handed_over(make: Make[Backbone]) -> None:
                 kept = value is parameters.get(backbone.passthrough[field])
                 require(kept, f"{field} is not the tensor that passthrough names")
             elif isinstance(value, Tensor):
-                known = bool(value.isfinite().all())
-                require(known, f"{field} is computed from a tensor that passthrough names")
+                is_finite = bool(value.isfinite().all())
+                require(is_finite, f"{field} is computed from a tensor that passthrough names")
 
 
 BACKBONE_CHECKS: tuple[Check[Backbone], ...] = (

@@ -57,8 +57,11 @@ def check_entry(entry: registry.Entry) -> list[Result]:
         loaded = load_command(entry) if entry.slot == COMMANDS else registry.load_entry(entry)
     except UserError as error:
         where = raised_at(error, entry.package) or _announced_at(entry)
-        told = [error.found or error.what, *([f"not {error.expected}"] if error.expected else [])]
-        lost = Result("it can be loaded", failure=listed(told), where=where)
+        reasons = [
+            error.found or error.what,
+            *([f"not {error.expected}"] if error.expected else []),
+        ]
+        lost = Result("it can be loaded", failure=listed(reasons), where=where)
         return [*names, lost]
     if entry.slot == COMMANDS:
         where, package = _announced_at(entry), entry.package
@@ -91,8 +94,8 @@ def _announced_at(entry: registry.Entry) -> str:
     loaded = sys.modules.get(module.strip())
     thing = getattr(loaded, name.strip(), None)
     # If the object belongs to another package, its location would not help the author.
-    own = defined_at(thing) if getattr(thing, "__module__", "") == module.strip() else ""
-    return own or getattr(loaded, "__file__", None) or entry.origin
+    location = defined_at(thing) if getattr(thing, "__module__", "") == module.strip() else ""
+    return location or getattr(loaded, "__file__", None) or entry.origin
 
 
 def _failed(check: str, error: BaseException, package: str, where: str) -> Result:

@@ -65,10 +65,10 @@ def _module(command: Command) -> str:
     """Return the module that defines the command."""
     if not isinstance(command, typer.Typer):
         return command.__module__
-    registered = [each.callback for each in (*command.registered_commands,)]
+    registered = [member.callback for member in (*command.registered_commands,)]
     if command.registered_callback is not None:
         registered.append(command.registered_callback.callback)
-    modules = [each.__module__ for each in registered if each is not None]
+    modules = [callback.__module__ for callback in registered if callback is not None]
     if not modules:
         raise cannot_tell("the typer app has no command of its own")
     return modules[0]

@@ -175,44 +175,48 @@ def _backbone_for(densifier: Densifier) -> Backbone:
     """Return a backbone that uses this densifier by default, or that has the tensors it edits."""
     fitting = []
     # Of several suitable backbones, use the first one, which is crossgrad's own.
-    known = sorted(entries("backbones").values(), key=lambda each: each.distribution != "crossgrad")
-    for entry in sorted(known, key=lambda each: each.name != BACKBONE):
+    candidates = sorted(
+        entries("backbones").values(), key=lambda entry: entry.distribution != "crossgrad"
+    )
+    for entry in sorted(candidates, key=lambda entry: entry.name != BACKBONE):
         try:
             backbone = build(Backbone, entry.name, {})
             have = {tensor for block in backbone.blocks() for tensor in block.tensors}
-            usual = load("densifiers", backbone.default_densifier)
+            default = load("densifiers", backbone.default_densifier)
         except (Exception, SystemExit):
             # If a backbone of another package is broken, the densifier is not the cause.
             continue
         if densifier.tensors <= have:
-            fitting.append((type(densifier) is not usual, backbone))
+            fitting.append((type(densifier) is not default, backbone))
     if not fitting:
         wanted = ", ".join(sorted(densifier.tensors))
         raise cannot_tell(f"no installed backbone has the tensors {wanted}")
-    return min(fitting, key=lambda each: each[0])[1]
+    return min(fitting, key=lambda pair: pair[0])[1]
 
 
 def require_good(edit: Edit, blocks: tuple[Block, ...], parameters: Parameters) -> None:
     """Require that an edit can be applied and that its values are finite."""
     misfit = misfit_of(edit, blocks, parameters)
     require(not misfit, f"the edit is inconsistent: {misfit}")
-    plain = all(type(each) is int for each in edit.counts.values())
+    plain = all(type(number) is int for number in edit.counts.values())
     require(plain, f"edit.counts is {edit.counts!r}; expected plain integers")
     number = primitives_of(blocks, parameters) if edit.source is None else len(edit.source)
     for name, overwrite in edit.values.items():
         values, rows = overwrite.values, overwrite.rows
         # A run would broadcast a smaller tensor over the rows, which is hardly ever intended.
         wanted = (number if rows is None else len(rows), *parameters[name].shape[1:])
-        found = tuple(values.shape)
-        require(found == wanted, f"edit.values of {name} has the shape {found}, expected {wanted}")
+        shape = tuple(values.shape)
+        require(shape == wanted, f"edit.values of {name} has the shape {shape}, expected {wanted}")
         require(values.isfinite().all(), f"edit.values of {name} is not finite")
 
 
 def its_needs_are_statistics(make: Make[Densifier]) -> None:
     """`needs` names optional outputs that rasterizers may provide; other names refuse every run."""
-    known = ("depth", "pixels", "abs_gradient", "directions", "count")
-    more = sorted(make().needs.difference(known))
-    require(not more, f"needs contains {listed(more)}; rasterizers can provide {listed(known)}")
+    statistics = ("depth", "pixels", "abs_gradient", "directions", "count")
+    more = sorted(make().needs.difference(statistics))
+    require(
+        not more, f"needs contains {listed(more)}; rasterizers can provide {listed(statistics)}"
+    )
 
 
 def quiet_before_its_time(make: Make[Densifier]) -> None:

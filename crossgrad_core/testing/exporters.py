@@ -35,8 +35,10 @@ def writes_one_file(make: Make[Exporter]) -> None:
             _require_kept(given, "write")
             good = isinstance(notes, tuple) and all(isinstance(note, str) for note in notes)
             require(good, f"write() returns {notes!r}, not a tuple of strings")
-        found = sorted(path.name for path in Path(folder).iterdir())
-        require(found == ["a", "b"], f"two files were expected; the folder contains {found}")
+        file_names = sorted(path.name for path in Path(folder).iterdir())
+        require(
+            file_names == ["a", "b"], f"two files were expected; the folder contains {file_names}"
+        )
         require(first.stat().st_size > 0, "the file is empty")
         same = first.read_bytes() == second.read_bytes()
         require(same, "two exports of the same Gaussians differ")
@@ -87,16 +89,16 @@ def what_it_writes_is_read_again(make: Make[Exporter]) -> None:
     with TemporaryDirectory() as folder:
         path = Path(folder) / f"a.{exporter.suffix}"
         exporter.write(_gaussians(), _FRAME, path, ())
-        found = exporter.read(path, _FRAME)
+        read_back = exporter.read(path, _FRAME)
     stored = exporter.stored(_gaussians())
     require(
-        len(found) == len(stored),
-        f"{len(stored)} Gaussians were written, but {len(found)} were read",
+        len(read_back) == len(stored),
+        f"{len(stored)} Gaussians were written, but {len(read_back)} were read",
     )
     # Positions lose their last bits, because the offset of the input frame is large.
     size = float(np.abs(_FRAME.offset).max()) * _FRAME.scale
     for name in ("means", "scales", "opacities"):
-        error = float((getattr(found, name) - getattr(stored, name)).abs().max())
+        error = float((getattr(read_back, name) - getattr(stored, name)).abs().max())
         require(
             error <= _ROUNDING * max(1.0, size),
             f"read() returns {name} that differ from those of stored() by up to "

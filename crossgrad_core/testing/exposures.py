@@ -20,8 +20,10 @@ def fitting_gives_an_installed_one(make: Make[Exposure]) -> None:
     exposure = make()
     fitted = exposure.fitted_to(sample_scene())
     require(isinstance(fitted, Fitted), f"fitted_to() returns {fitted!r}, not a Fitted")
-    told = isinstance(fitted.notes, tuple) and all(isinstance(note, str) for note in fitted.notes)
-    require(told, f"the notes of fitted_to() are {fitted.notes!r}, not a tuple of strings")
+    are_texts = isinstance(fitted.notes, tuple) and all(
+        isinstance(note, str) for note in fitted.notes
+    )
+    require(are_texts, f"the notes of fitted_to() are {fitted.notes!r}, not a tuple of strings")
     kind = type(exposure) if fitted.name is None else load(Exposure, fitted.name)
     right = type(fitted.exposure) is kind
     require(right, f"fitted_to() returns {fitted.exposure!r} under the name {fitted.name!r}")
@@ -29,9 +31,9 @@ def fitting_gives_an_installed_one(make: Make[Exposure]) -> None:
 
 def every_photo_has_a_start(make: Make[Exposure]) -> None:
     """Each parameter starts with one finite float32 row per training photo, and is trained."""
-    for name, each in make().per_photo(sample_scene()).items():
-        _require_rows(f"the initial value of {name}", each.first())
-        require(each.lr.initial > 0, f"the learning rate of {name} is {each.lr.initial}")
+    for name, parameter in make().per_photo(sample_scene()).items():
+        _require_rows(f"the initial value of {name}", parameter.first())
+        require(parameter.lr.initial > 0, f"the learning rate of {name} is {parameter.lr.initial}")
 
 
 def an_image_stays_an_image(make: Make[Exposure]) -> None:
@@ -56,8 +58,10 @@ def gradients_reach_render_and_values(make: Make[Exposure]) -> None:
     taken = exposure.apply(image, values)
     weights = torch.rand(taken.shape, generator=torch.Generator().manual_seed(4))
     inputs = {"the render": image, **values}
-    found = torch.autograd.grad((taken * weights).sum(), list(inputs.values()), allow_unused=True)
-    for name, gradient in zip(inputs, found, strict=True):
+    gradients = torch.autograd.grad(
+        (taken * weights).sum(), list(inputs.values()), allow_unused=True
+    )
+    for name, gradient in zip(inputs, gradients, strict=True):
         require(gradient is not None, f"{name} receives no gradient")
         good = gradient is not None and gradient.isfinite().all()
         require(good, f"the gradient of {name} is not finite")
@@ -66,17 +70,17 @@ def gradients_reach_render_and_values(make: Make[Exposure]) -> None:
 def projected_values_stay_projected(make: Make[Exposure]) -> None:
     """The projection keeps names and shapes, does not change its input, and is idempotent."""
     exposure = make()
-    values = {name: each + _noise(each) for name, each in _starts(exposure).items()}
+    values = {name: tensor + _noise(tensor) for name, tensor in _starts(exposure).items()}
     if not values:
         raise cannot_tell("it has no parameters")
-    kept = {name: each.clone() for name, each in values.items()}
+    kept = {name: tensor.clone() for name, tensor in values.items()}
     once = exposure.project(values)
     require(once.keys() == values.keys(), f"the parameters {sorted(values)} became {sorted(once)}")
-    for name, each in once.items():
-        _require_rows(f"the projected {name}", each)
+    for name, tensor in once.items():
+        _require_rows(f"the projected {name}", tensor)
         require(torch.equal(values[name], kept[name]), f"the projection changes {name} in place")
         again = exposure.project(once)[name]
-        close = torch.allclose(again, each, rtol=_ROUNDING, atol=_ROUNDING)
+        close = torch.allclose(again, tensor, rtol=_ROUNDING, atol=_ROUNDING)
         require(close, f"a second projection changes {name} again")
 
 
@@ -100,18 +104,22 @@ def same_input_same_bits(make: Make[Exposure]) -> None:
 
 
 def _starts(exposure: Exposure) -> dict[str, Tensor]:
-    return {name: each.first() for name, each in exposure.per_photo(sample_scene()).items()}
+    return {
+        name: parameter.first() for name, parameter in exposure.per_photo(sample_scene()).items()
+    }
 
 
 def _first(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return {name: each[0] for name, each in values.items()}
+    return {name: rows[0] for name, rows in values.items()}
 
 
 def _require_rows(what: str, value: Tensor) -> None:
     photos = len(sample_scene().train_views)
     right = value.ndim > 0 and value.shape[0] == photos and value.dtype == torch.float32
-    found = f"{value.dtype} of shape {list(value.shape)}"
-    require(right, f"{what} is {found}; expected float32 with {photos} rows, one for each photo")
+    description = f"{value.dtype} of shape {list(value.shape)}"
+    require(
+        right, f"{what} is {description}; expected float32 with {photos} rows, one for each photo"
+    )
     require(value.isfinite().all(), f"{what} is not finite")
 
 

@@ -64,8 +64,8 @@ def every_view_has_a_declared_label(make: Make[Grouping]) -> None:
 def every_group_has_training_views(make: Make[Grouping]) -> None:
     """A declared group without training views raises an error: samplers draw from all groups."""
     grouping, scene = make(), sample_scene()
-    found = set(fitted(grouping, scene).labels(scene.train_views))
-    empty = sorted(set(grouping.labels) - found)
+    present = set(fitted(grouping, scene).labels(scene.train_views))
+    empty = sorted(set(grouping.labels) - present)
     require(not empty, f"groups without training views: {listed(empty)}; raise UserError instead")
 
 
@@ -92,9 +92,9 @@ def the_quantity_is_one_number_per_view(make: Make[Grouping]) -> None:
     require(bool(together.name.strip()), "the quantity has no name")
     shape = np.shape(together.values)
     require(shape == (len(scene.views),), f"{len(scene.views)} views have values {list(shape)}")
-    for place, view in enumerate(scene.views):
+    for row, view in enumerate(scene.views):
         alone = grouping.quantity(scene, (view,))
-        same = alone is not None and np.allclose(alone.values[0], together.values[place])
+        same = alone is not None and np.allclose(alone.values[0], together.values[row])
         require(same, f"{view.name} has another value when it is measured alone")
 
 

@@ -40,8 +40,8 @@ def _require_points(more: object) -> None:
     count = len(more.positions)
     shapes = {"positions": (count, 3), "colors": (count, 3), "sizes": (count,)}
     for name, shape in {**shapes, "opacities": (count,)}.items():
-        found = getattr(more, name).shape
-        require(found == shape, f"{name} has the shape {found}; {count} points need {shape}")
+        actual = getattr(more, name).shape
+        require(actual == shape, f"{name} has the shape {actual}; {count} points need {shape}")
     require(more.colors.dtype == np.uint8, f"colors are {more.colors.dtype}, not uint8")
     require(bool(np.isfinite(more.positions).all()), "a position is not finite")
     sizes, opacities = more.sizes, more.opacities
@@ -57,13 +57,13 @@ def answers_alike(make: Make[Initializer]) -> None:
     with global_randomness_untouched():
         one, other = make(), make()
         first, second = one.more_points(scene), other.more_points(scene)
-        told = one.messages(scene) == other.messages(scene)
-    require(told, "remarks() returns different notes in two calls")
+        same_messages = one.messages(scene) == other.messages(scene)
+    require(same_messages, "remarks() returns different notes in two calls")
     require((first is None) == (second is None), "points are added in only one of two calls")
     if first is not None and second is not None:
-        for each in fields(first):
-            same = np.array_equal(getattr(first, each.name), getattr(second, each.name))
-            require(same, f"{each.name} differ between two calls")
+        for field in fields(first):
+            same = np.array_equal(getattr(first, field.name), getattr(second, field.name))
+            require(same, f"{field.name} differ between two calls")
 
 
 INITIALIZER_CHECKS: tuple[Check[Initializer], ...] = (*COMPONENT_CHECKS, adds_points, answers_alike)

@@ -23,9 +23,10 @@ def names_its_figure(make: Make[Metric]) -> None:
     require(name.isidentifier() and name == name.lower(), f"{name!r} is not a valid column name")
     require(label, "the figure has no label")
     require(format(0.5, make().figure.form), f"the format {make().figure.form!r} prints nothing")
-    told = make().described().name
+    described_name = make().described().name
     require(
-        told == name, f"described() returns the metric name {told!r}, but figure contains {name!r}"
+        described_name == name,
+        f"described() returns the metric name {described_name!r}, but figure contains {name!r}",
     )
 
 

@@ -161,11 +161,11 @@ def _step_end(hooks: Hooks, step: int, answers: list[Answer]) -> None:
 def survives_every_event(make: Make[Observer]) -> None:
     """All events of a run raise nothing, with and without an output folder."""
     with TemporaryDirectory() as folder:
-        for place in (Path(folder), None):
+        for output_folder in (Path(folder), None):
             observer = make()
             with _hooks(observer) as hooks:
-                _start(hooks, place)
-                for step in _STEPS if place else (1, 2):
+                _start(hooks, output_folder)
+                for step in _STEPS if output_folder else (1, 2):
                     _require_survival(hooks, observer, step)
                 hooks.crossgrad_evaluation(
                     report=EvaluationReport(2, {"step": 2, "psnr": 20.0, "ssim": None})
@@ -266,7 +266,7 @@ def questions_are_answered_in_kind(make: Make[Observer]) -> None:
     kept = {name: tensor.detach().clone() for name, tensor in run.parameters.items()}
     with _hooks(make()) as hooks, global_randomness_untouched():
         for reasons in hooks.crossgrad_validate_selection(selection=selection):
-            good = isinstance(reasons, list) and all(isinstance(each, str) for each in reasons)
+            good = isinstance(reasons, list) and all(isinstance(reason, str) for reason in reasons)
             require(
                 good, f"crossgrad_validate_selection returns {reasons!r}, not a list of strings"
             )

@@ -38,8 +38,8 @@ def _backward(loss: Tensor) -> None:
 
 
 def _shape(name: str, tensor: Tensor | None, *expected: int) -> None:
-    found = None if tensor is None else list(tensor.shape)
-    require(found == list(expected), f"{name} has the shape {found}, expected {list(expected)}")
+    shape = None if tensor is None else list(tensor.shape)
+    require(shape == list(expected), f"{name} has the shape {shape}, expected {list(expected)}")
 
 
 def renders_have_the_shape(make: Make[Rasterizer]) -> None:
@@ -73,11 +73,11 @@ def nothing_to_draw_is_no_error(make: Make[Rasterizer]) -> None:
     """Without Gaussians in front of the camera, the image is the background and radii are 0."""
     rasterizer = make()
     device = device_of(rasterizer)
-    some = moved(sample_gaussians(), device)
+    sample = moved(sample_gaussians(), device)
     behind = 2.0 * sample_camera().center.to(device).float()
     for gaussians, what in (
         (moved(sample_gaussians(0), device), "no Gaussians"),
-        (replace(some, means=(some.means.detach() + behind).requires_grad_()), "all behind"),
+        (replace(sample, means=(sample.means.detach() + behind).requires_grad_()), "all behind"),
     ):
         render = _drawn(rasterizer, gaussians, 0.25)
         require((render.image == 0.25).all(), f"{what}: the image is not the background")  # noqa: PLR2004
@@ -138,17 +138,17 @@ def statistics_are_filled(make: Make[Rasterizer]) -> None:
 
 
 def _directions_are_of_pixels(screen: Screen) -> None:
-    found, absolute = screen.directions, screen.abs_gradient
-    shape = None if found is None else tuple(found.shape)
+    directions, absolute = screen.directions, screen.abs_gradient
+    shape = None if directions is None else tuple(directions.shape)
     wanted = (screen.radii.shape[0], 6, 5)
     require(shape == wanted, f"screen.directions has shape {shape}, expected {wanted}")
-    if found is None:
+    if directions is None:
         return
-    length, count = found[..., :2].norm(dim=-1), found[..., 4]
+    length, count = directions[..., :2].norm(dim=-1), directions[..., 4]
     require((length <= count * (1 + _ROUNDING)).all(), "screen.directions are not of unit length")
     require((count == count.round()).all() and count.any(), "screen.directions counts no pixels")
     if absolute is not None:
-        short = (found[..., 2:4].sum(1) - absolute).abs().max()
+        short = (directions[..., 2:4].sum(1) - absolute).abs().max()
         same = short <= _ROUNDING * absolute.max()
         require(same, "the bins of screen.directions do not add up to screen.abs_gradient")
 
@@ -181,12 +181,12 @@ def dilations_of_gaussians_are_heeded(make: Make[Rasterizer]) -> None:
         wider = type(rasterizer)(**{**rasterizer.model_dump(), "dilation": 1.0})
     except ValidationError:
         raise cannot_tell("the rasterizer supports only one dilation") from None
-    some = moved(sample_gaussians(harmonics=False), device_of(rasterizer))
+    gaussians = moved(sample_gaussians(harmonics=False), device_of(rasterizer))
     with torch.no_grad():
-        plain, own = (_drawn(each, some).image for each in (rasterizer, wider))
-        wide = _drawn(rasterizer, replace(some, dilation=1.0)).image
+        plain, widened = (_drawn(variant, gaussians).image for variant in (rasterizer, wider))
+        wide = _drawn(rasterizer, replace(gaussians, dilation=1.0)).image
     require(not torch.equal(plain, wide), "the dilation of the Gaussians has no effect")
-    error = float((own - wide).abs().max())
+    error = float((widened - wide).abs().max())
     require(
         error < _ROUNDING,
         f"the dilation of the Gaussians changes pixels by {error:.2g} more than the "
@@ -199,29 +199,29 @@ def rows_on_demand_are_asked_for(make: Make[Rasterizer]) -> None:
     rasterizer = make()
     if not rasterizer.sparse_rows:
         return
-    some = moved(sample_gaussians(harmonics=True), device_of(rasterizer))
+    gaussians = moved(sample_gaussians(harmonics=True), device_of(rasterizer))
     with torch.no_grad():
-        some.means[::2] = 2.0 * sample_camera().center.to(some.means)
-    late = moved(some, some.means.device)
+        gaussians.means[::2] = 2.0 * sample_camera().center.to(gaussians.means)
+    late = moved(gaussians, gaussians.means.device)
     tensors = {name: getattr(late, name) for name in ("sh_dc", "sh_rest")}
     asked: list[int] = []
 
     def bring(rows: Tensor | None) -> None:
-        chosen = torch.arange(len(some)) if rows is None else rows.long()
+        chosen = torch.arange(len(gaussians)) if rows is None else rows.long()
         asked.extend(chosen.tolist())
         for name, tensor in tensors.items():
-            tensor.data[chosen] = getattr(some, name).detach()[chosen]
+            tensor.data[chosen] = getattr(gaussians, name).detach()[chosen]
 
     for tensor in tensors.values():
         tensor.data.fill_(torch.nan)
     demand = OnDemand(frozenset(tensors), bring)
-    plain = _drawn(rasterizer, some, backward=True)
+    plain = _drawn(rasterizer, gaussians, backward=True)
     render = _drawn(rasterizer, replace(late, on_demand=demand), backward=True)
     require(torch.equal(render.image, plain.image), "sparse rows give another image")
     unseen = not any(row % 2 == 0 for row in asked)
     require(len(set(asked)) == len(asked) and unseen, f"the rows {asked} were requested")
     for name, tensor in tensors.items():
-        gradient, expected = tensor.grad, getattr(some, name).grad
+        gradient, expected = tensor.grad, getattr(gaussians, name).grad
         good = gradient is not None and gradient.is_sparse
         require(good, f"the gradient of {name} is not sparse")
         same = gradient is not None and torch.equal(gradient.to_dense(), expected)

@@ -110,11 +110,11 @@ def pixels_add_up(make: Make[Resolution]) -> None:
     resolution, schedule = make().fitted_to(sample_scene()), Schedule.for_run(STEPS)
     for before, after in pairwise((0, *_STEPS)):
         pixels = resolution.pixels(schedule, after) - resolution.pixels(schedule, before)
-        told = (
+        message = (
             f"pixels() increases by {pixels} from step {before} to step {after}, with one "
             "view per step"
         )
-        require(0.0 < pixels <= after - before + 1e-6 * after, told)
+        require(0.0 < pixels <= after - before + 1e-6 * after, message)
 
 
 RESOLUTION_CHECKS: tuple[Check[Resolution], ...] = (

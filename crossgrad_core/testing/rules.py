@@ -51,10 +51,10 @@ def goes_on_from_a_checkpoint(make: Make[Rule]) -> None:
         _steps(setup, state, _STOP)
         again = from_checkpoint(setup, deepcopy(to_checkpoint(state)))
         again.states = {name: revived(held) for name, held in again.states.items()}
-        for each in (state, again):
-            _steps(setup, each, _STEPS)
-            for _ in final_edits(setup, each):
-                require(each.primitives(setup), "no Gaussian is left at the end of a run")
+        for run_state in (state, again):
+            _steps(setup, run_state, _STEPS)
+            for _ in final_edits(setup, run_state):
+                require(run_state.primitives(setup), "no Gaussian is left at the end of a run")
     for name, tensor in state.parameters.items():
         same = torch.equal(tensor, again.parameters[name])
         require(same, f"a resumed run differs in {name}: keep all state of a rule in its state")

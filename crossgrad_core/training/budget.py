@@ -129,13 +129,15 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
     probed = replace(unwatched(setup), schedule=_without_edits(setup.schedule))
     state, pace, share = first_state(unwatched(setup)), setup.schedule.pace, setup.pixel_share
     state.step = _FULL_SIZE
-    steps, each = _probed(probed, state, seconds)
-    note = f"{steps} probed steps took {each * pace.at(_FULL_SIZE) * 1000:.1f} ms each"
+    steps, seconds_per_step = _probed(probed, state, seconds)
+    note = f"{steps} probed steps took {seconds_per_step * pace.at(_FULL_SIZE) * 1000:.1f} ms each"
     crowd = PrimitiveCounts.of(setup, state)
 
     def fitting(share: float) -> int:
         measured = replace(setup, pixel_share=share)
-        return _fitting(lambda steps: cost_of_run(measured, crowd, steps), seconds / each)
+        return _fitting(
+            lambda steps: cost_of_run(measured, crowd, steps), seconds / seconds_per_step
+        )
 
     # The number of pixels in the first steps may depend on the length.
     fits = fitting(share)
@@ -146,7 +148,7 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
         state = first_state(unwatched(setup))
         steps, small = _probed(replace(probed, schedule=first), state, seconds)
         note += f" at full size, {steps} at first {small * first.pace.at(1) * 1000:.1f} ms"
-        share = min(1.0, max(0.0, (1.0 - small / each) / (1.0 - pixels)))
+        share = min(1.0, max(0.0, (1.0 - small / seconds_per_step) / (1.0 - pixels)))
         fits = fitting(share)
     total = min(fits, most_steps(setup))
     if total < fits:
@@ -258,9 +260,9 @@ class Timed:
         seconds = state.clock.trained(self._kind) - self._clock
         newest = seconds / views_of(setup, setup.schedule, self._step, state.step)
         before = newest if self._each is None else self._each
-        self._each = each = before + SMOOTHING * (newest - before)
+        self._each = seconds_per_view = before + SMOOTHING * (newest - before)
         self._look(state)
-        affordable = (self._seconds - state.clock.trained(self._kind)) / each
+        affordable = (self._seconds - state.clock.trained(self._kind)) / seconds_per_view
         crowd, step = PrimitiveCounts.of(setup, state), state.step
         fits = step + _fitting(lambda left: cost_ahead(setup, crowd, step, left), affordable)
         total = min(fits, self._most)

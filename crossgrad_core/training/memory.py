@@ -106,13 +106,13 @@ class Demand:
 
 def kept_bytes(records: Iterable[ViewRecord], parameters: Iterable[Tensor]) -> int:
     """Return the bytes of the tensors in the records of a step, without the parameters."""
-    own = {tensor.untyped_storage().data_ptr() for tensor in parameters}
+    parameter_storages = {tensor.untyped_storage().data_ptr() for tensor in parameters}
     held: dict[int, int] = {}
     for record in records:
         for tensor in _tensors((*vars(record.gaussians).values(), *vars(record.screen).values())):
             storage = tensor.untyped_storage()
             held[storage.data_ptr()] = storage.nbytes()
-    return sum(size for place, size in held.items() if place not in own)
+    return sum(size for address, size in held.items() if address not in parameter_storages)
 
 
 def _tensors(values: Iterable[object]) -> Iterable[Tensor]:

@@ -22,15 +22,15 @@ def mode_note(name: str, grouping: Grouping, scene: Scene) -> tuple[str, ...]:
     quantity = grouping.quantity(scene, scene.train_views)
     if quantity is None:
         return ()
-    found = bimodality(quantity.values[np.isfinite(quantity.values)])
-    figure = found.deciding
+    measured = bimodality(quantity.values[np.isfinite(quantity.values)])
+    figure = measured.deciding
     # The coefficient is NaN if all values are equal or there are too few values.
     if not figure < ONE_MODE:
         return ()
     return (
         (
             f"grouping {name} splits values that form only one group: the bimodality of "
-            f"{quantity.name} is {figure:.2f} over {found.size} training views (below "
+            f"{quantity.name} is {figure:.2f} over {measured.size} training views (below "
             f"{ONE_MODE}), so that the split is arbitrary; sampler {SAMPLER} needs no "
             "groups"
         ),

@@ -35,7 +35,7 @@ class Numbers:
         Raises:
             UserError: A number has no value, because no recipe decided it.
         """
-        values = {each.name: getattr(config, each.name) for each in fields(cls)}
+        values = {field.name: getattr(config, field.name) for field in fields(cls)}
         if missing := [name for name, value in values.items() if value is None]:
             raise UserError(
                 "some settings that the run needs have no value",

@@ -45,9 +45,10 @@ def write_values(
     Raises:
         UserError: The disk is full, or the folder is not writable.
     """
-    plain = {name: each.detach().cpu().tolist() for name, each in values.items()}
+    plain = {name: tensor.detach().cpu().tolist() for name, tensor in values.items()}
     rows = {
-        photo: {name: each[row] for name, each in plain.items()} for row, photo in enumerate(photos)
+        photo: {name: of_all[row] for name, of_all in plain.items()}
+        for row, photo in enumerate(photos)
     }
     content = {"format": PHOTO_VALUES_FORMAT, "exposure": exposure, "photos": rows}
     write_atomically(path, (json.dumps(content, indent=1) + "\n").encode())
@@ -65,15 +66,15 @@ def read_values(path: Path, like: Mapping[str, Tensor]) -> dict[str, dict[str, T
     """
     content = _content(path)
     exposure = content.get("exposure", "another one")
-    found = {}
+    values_by_photo = {}
     for photo, values in content["photos"].items():
         if not isinstance(values, dict) or values.keys() != like.keys():
             names = listed(values) if isinstance(values, dict) else repr(values)
             raise _misfit(path, exposure, listed(like), f"{names} of photo {photo}")
-        found[photo] = {
-            name: _value(path, exposure, values[name], each[0]) for name, each in like.items()
+        values_by_photo[photo] = {
+            name: _value(path, exposure, values[name], tensor[0]) for name, tensor in like.items()
         }
-    return found
+    return values_by_photo
 
 
 def _content(path: Path) -> dict[str, Any]:
@@ -135,12 +136,12 @@ def started(setup: Setup) -> PluginState | None:
     parameters = setup.per_photo
     if not parameters:
         return None
-    starts = {name: each.first() for name, each in parameters.items()}
+    starts = {name: parameter.first() for name, parameter in parameters.items()}
     for name, start in starts.items():
         _check(setup, f"initializes parameter {name} with", start)
     tensors = {}
-    for name, each in (known_starts(setup) or starts).items():
-        start = each.detach().to(setup.device).clone(memory_format=torch.contiguous_format)
+    for name, tensor in (known_starts(setup) or starts).items():
+        start = tensor.detach().to(setup.device).clone(memory_format=torch.contiguous_format)
         tensors[f"{_VALUE}.{name}"] = start
         tensors[f"{_FIRST}.{name}"] = torch.zeros_like(start)
         tensors[f"{_SECOND}.{name}"] = torch.zeros_like(start)
@@ -159,22 +160,22 @@ def known_starts(setup: Setup) -> Mapping[str, Tensor]:
     path = setup.config.exposure_from
     if path is None:
         return {}
-    starts = {name: each.first() for name, each in setup.per_photo.items()}
+    starts = {name: parameter.first() for name, parameter in setup.per_photo.items()}
     warn_if_changed(path)
-    known = read_values(path, starts)
+    values_by_photo = read_values(path, starts)
     names = [view.name for view in setup.train_views]
-    rows = [row for row, name in enumerate(names) if name in known]
+    rows = [row for row, name in enumerate(names) if name in values_by_photo]
     if not rows:
         raise UserError(
             "the file contains no values for the training photos",
             where=path,
             expected=f"photos such as {names[0]}",
-            found=listed(list(known)[:3]),
+            found=listed(list(values_by_photo)[:3]),
             todo="name the exposure.json of a run on this scene, or leave --exposure-from out",
         )
     merged = {}
     for name, start in starts.items():
-        values = torch.stack([known[names[row]][name] for row in rows])
+        values = torch.stack([values_by_photo[names[row]][name] for row in rows])
         merged[name] = setup.exposure.shift(name, start, start[rows].mean(0), values.mean(0))
         merged[name][rows] = values
     return setup.exposure.project(merged)
@@ -208,7 +209,7 @@ def write_photos(setup: Setup, state: TrainState, path: Path) -> bool:
 def leaves_of(setup: Setup, state: TrainState, index: int) -> Leaves:
     """Return copies of a training photo's values that collect gradients."""
     values = _values(setup, state)
-    return {name: each[index].detach().clone().requires_grad_() for name, each in values.items()}
+    return {name: rows[index].detach().clone().requires_grad_() for name, rows in values.items()}
 
 
 def apply(setup: Setup, state: TrainState, view: View, image: Tensor) -> Tensor:
@@ -216,10 +217,10 @@ def apply(setup: Setup, state: TrainState, view: View, image: Tensor) -> Tensor:
     values = _values(setup, state)
     row = setup.row_of.get(view.name)
     if row is not None:
-        own: Mapping[str, Tensor] = {name: each[row] for name, each in values.items()}
+        view_values: Mapping[str, Tensor] = {name: rows[row] for name, rows in values.items()}
     else:
-        own = setup.exposure.predict_unseen(view, setup.scene, values) if values else {}
-    return setup.exposure.apply(image, own)
+        view_values = setup.exposure.predict_unseen(view, setup.scene, values) if values else {}
+    return setup.exposure.apply(image, view_values)
 
 
 def take_photo_step(
@@ -245,13 +246,13 @@ def take_photo_step(
     tensors = {name: tensor.clone() for name, tensor in held.tensors.items()}
     # A checkpoint may have moved it to the GPU, where each step would wait for it.
     tensors[_COUNT] = tensors[_COUNT].cpu()
-    rates = {name: each.lr.at(progress) for name, each in setup.per_photo.items()}
+    rates = {name: parameter.lr.at(progress) for name, parameter in setup.per_photo.items()}
     for row, gradients in _summed(taken).items():
         _check_gradients(setup, state, row, gradients)
-        part = partial(_row, tensors, row, gradients)
+        row_values = partial(_row, tensors, row, gradients)
         steps = dict.fromkeys(gradients, int(tensors[_COUNT][row]))
-        moments = AdamState(part(_FIRST), part(_SECOND), steps)
-        adam_step(part(_VALUE), gradients, moments, rates)
+        moments = AdamState(row_values(_FIRST), row_values(_SECOND), steps)
+        adam_step(row_values(_VALUE), gradients, moments, rates)
         tensors[_COUNT][row] += 1
     values = {name: tensors[f"{_VALUE}.{name}"] for name in setup.per_photo}
     for name, value in setup.exposure.project(values).items():
@@ -267,13 +268,13 @@ def _values(setup: Setup, state: TrainState) -> dict[str, Tensor]:
 
 def _summed(taken: Iterable[tuple[int, Leaves]]) -> dict[int, dict[str, Tensor]]:
     """Return position of a photo -> gradients of its values, summed over repeated draws."""
-    found: dict[int, dict[str, Tensor]] = {}
+    gradients_by_row: dict[int, dict[str, Tensor]] = {}
     for row, leaves in taken:
-        gradients = found.setdefault(row, {})
+        gradients = gradients_by_row.setdefault(row, {})
         for name, leaf in leaves.items():
             if leaf.grad is not None:
                 gradients[name] = gradients[name] + leaf.grad if name in gradients else leaf.grad
-    return found
+    return gradients_by_row
 
 
 def _row(

@@ -28,5 +28,5 @@ def view_gradients(model: Model, view: View, tensors: Sequence[str]) -> dict[str
     loss = model.loss.loss(model.exposed(view, image), photo, mask, None)
     if not loss.requires_grad:
         return {}
-    found = torch.autograd.grad(loss, list(wanted.values()), allow_unused=True)
-    return {n: g.detach() for n, g in zip(wanted, found, strict=True) if g is not None}
+    gradients = torch.autograd.grad(loss, list(wanted.values()), allow_unused=True)
+    return {n: g.detach() for n, g in zip(wanted, gradients, strict=True) if g is not None}

@@ -30,13 +30,13 @@ def check_axes(setup: Setup, parameters: Parameters) -> None:
     if (names := setup.backbone.gaussian_tensors) is None:
         return
     rows = len(parameters[names[0]]) if names[0] in parameters else 0
-    found = [tuple(parameters[each].shape) if each in parameters else None for each in names]
-    if found != [(rows, columns) for columns in _AXES]:
+    shapes = [tuple(parameters[name].shape) if name in parameters else None for name in names]
+    if shapes != [(rows, columns) for columns in _AXES]:
         raise UserError(
             "the axes that the backbone names do not have the shapes of Gaussians",
             where=f"backbone {setup.selection.names['backbone']}, axes {listed(names)}",
             expected=f"tensors {listed(f'[N, {columns}]' for columns in _AXES)}",
-            found=listed(map(str, found)),
+            found=listed(map(str, shapes)),
             todo="repair the plugin (docs/write-a-backbone.md)",
         )
 

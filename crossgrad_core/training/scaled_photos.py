@@ -136,8 +136,8 @@ def reduced(image: Tensor, mask: Tensor | None, width: int, height: int) -> Pair
     rows = image.cpu().contiguous().numpy().reshape(image.shape[0], -1)
     small, counts = np.empty((height, width, 3), np.uint8), np.empty((height, width), np.bool_)
     reduce_by_area(rows, kept, small, counts)
-    found = torch.from_numpy(small).to(image.device)
-    return found, None if counts.all() else torch.from_numpy(counts).to(image.device)
+    small_image = torch.from_numpy(small).to(image.device)
+    return small_image, None if counts.all() else torch.from_numpy(counts).to(image.device)
 
 
 @contextmanager

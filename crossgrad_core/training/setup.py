@@ -41,8 +41,8 @@ def learns_in(step: int, every: int) -> bool:
     A hash chooses one step of each `every` steps. No photo or regime is therefore left out if a
     sampler cycles through photos or regimes.
     """
-    turn, place = divmod(step - 1, every)
-    return place == hash32(turn) * every >> 32
+    turn, offset = divmod(step - 1, every)
+    return offset == hash32(turn) * every >> 32
 
 
 @dataclass(frozen=True)
@@ -200,7 +200,7 @@ class Setup:
         """Return the run with these rules in place of its own rules."""
         if rules == self.selection.rules:
             return self
-        others = {n: each for n, each in self.plugins.items() if not isinstance(each, Rule)}
+        others = {n: plugin for n, plugin in self.plugins.items() if not isinstance(plugin, Rule)}
         selection = replace(self.selection, rules=rules)
         plugins = {**selection.plugins, **others}
         return replace(self, selection=selection, manager=make_manager(plugins), plugins=plugins)
@@ -324,12 +324,14 @@ class Setup:
         hook = self.hook.crossgrad_update_intervals
         trained = {name for block in self.trained_blocks for name in block.tensors}
         answers: list[Mapping[str, int]] = hook(blocks=self.trained_blocks)
-        found = {name: every for answer in answers for name, every in answer.items()}
-        if wrong := {n: e for n, e in found.items() if n not in trained or int(e) != e or e < 1}:
+        intervals = {name: every for answer in answers for name, every in answer.items()}
+        if wrong := {
+            n: e for n, e in intervals.items() if n not in trained or int(e) != e or e < 1
+        }:
             raise wrong_answer(
                 hook, "trained tensors, each with a number of at least 1", str(wrong)
             )
-        return found
+        return intervals
 
     def resting(self, step: int) -> frozenset[str]:
         """Return the names of the tensors that do not learn in a step."""

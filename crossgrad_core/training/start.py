@@ -206,18 +206,18 @@ def _begun(setup: Setup) -> Scene:
     )
 
 
-def _misfit(begun: Scene, known: int) -> str:
-    """Return the problem of the points after the first `known` ones; empty if all are valid."""
-    points, sizes, opacities = begun.points[known:], begun.point_sizes, begun.point_opacities
+def _misfit(begun: Scene, known_count: int) -> str:
+    """Return the problem of the points after the first `known_count`; empty if all are valid."""
+    points, sizes, opacities = begun.points[known_count:], begun.point_sizes, begun.point_opacities
     if sizes is None or opacities is None:
         return ""
     counts = {"colors": len(begun.point_colors), "sizes": len(sizes), "opacities": len(opacities)}
     for name, count in counts.items():
         if count != len(begun.points):
-            return f"{len(points)} positions, {count - known} {name}"
+            return f"{len(points)} positions, {count - known_count} {name}"
     if not np.isfinite(points).all():
         return "a position that is not finite"
-    sizes, opacities = sizes[known:], opacities[known:]
+    sizes, opacities = sizes[known_count:], opacities[known_count:]
     # NaN means that the backbone chooses the size or the opacity.
     if not (((sizes > 0.0) & np.isfinite(sizes)) | np.isnan(sizes)).all():
         return "a size that is not a number above 0"
@@ -262,8 +262,8 @@ def thinned(scene: Scene, share: float, rng: np.random.Generator) -> Scene:
         added = np.isfinite(scene.point_sizes)
     if int(added.sum()) >= wanted:
         added[:] = False
-    own = rng.choice(np.flatnonzero(~added), wanted - int(added.sum()), replace=False)
-    return scene.with_points(np.sort(np.concatenate([np.flatnonzero(added), own])))
+    kept_rows = rng.choice(np.flatnonzero(~added), wanted - int(added.sum()), replace=False)
+    return scene.with_points(np.sort(np.concatenate([np.flatnonzero(added), kept_rows])))
 
 
 def start_notes(setup: Setup, state: TrainState) -> tuple[str, ...]:

@@ -287,13 +287,13 @@ def _odd(value: object, device: str) -> str:
     if not isinstance(value, Tensor):
         return f"of type {type(value).__name__}, not a tensor"
     plain = value.layout == torch.strided and not value.dtype.is_complex and not value.is_quantized
-    found = value.layout, value.dtype, value.device
-    return "" if plain and value.device.type in {"cpu", device} else listed(map(str, found))
+    facts = value.layout, value.dtype, value.device
+    return "" if plain and value.device.type in {"cpu", device} else listed(map(str, facts))
 
 
 def _answering(hook: HookCaller) -> list[str]:
     """Return the names of the plugins that implement a hook."""
-    return [each.plugin_name for each in hook.get_hookimpls()]
+    return [implementation.plugin_name for implementation in hook.get_hookimpls()]
 
 
 def _no_states(hook: HookCaller, what: str, expected: str, found: object) -> UserError:
@@ -412,7 +412,7 @@ class Snapshot:
     def _tensors(state: TrainState, copies: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the copies with the same `requires_grad` as the tensors of the state."""
         learns = {name: tensor.requires_grad for name, tensor in state.tensors.items()}
-        return {name: each.requires_grad_(learns[name]) for name, each in copies.items()}
+        return {name: copied.requires_grad_(learns[name]) for name, copied in copies.items()}
 
 
 def copied_moments(adam: AdamState) -> AdamState:

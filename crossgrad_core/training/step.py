@@ -121,8 +121,8 @@ def labels_of(rule: GroupingRule, scene: Scene, name: str) -> tuple[str, ...]:
 
 def groups_of(setup: Setup, state: TrainState) -> tuple[str, ...] | None:
     """Return the present label of each training view; None without a grouping."""
-    known = state.states.get(GROUPING, EMPTY_STATE).values.get(_LABELS)
-    return tuple(map(str, known)) if isinstance(known, list) else setup.groups
+    labels = state.states.get(GROUPING, EMPTY_STATE).values.get(_LABELS)
+    return tuple(map(str, labels)) if isinstance(labels, list) else setup.groups
 
 
 #: Name of the stream for all random numbers of extra views.
@@ -373,8 +373,8 @@ def _sample(setup: Setup, state: TrainState) -> ViewSample:
     state.accept(answer.states, setup.hook.crossgrad_sample_views)
     counts, photos = setup.sampler.counts(context.views_per_step), len(setup.train_views)
     views = answer.draw.views
-    known = all(isinstance(each, int | np.integer) and 0 <= each < photos for each in views)
-    if known and len(views) in counts:
+    are_positions = all(isinstance(view, int | np.integer) and 0 <= view < photos for view in views)
+    if are_positions and len(views) in counts:
         # A checkpoint cannot contain NumPy integers.
         views = tuple(map(int, views))
         return replace(answer.draw, views=views, labels=_labels(setup, state, answer.draw))
@@ -394,7 +394,7 @@ def _labels(setup: Setup, state: TrainState, draw: ViewSample) -> tuple[str, ...
     if labels is None:
         return None
     given = tuple(labels) if isinstance(labels, tuple | list | np.ndarray) else ()
-    if len(given) == len(draw.views) and all(isinstance(each, str) for each in given):
+    if len(given) == len(draw.views) and all(isinstance(label, str) for label in given):
         return tuple(map(str, given))
     raise UserError(
         "the sampler returned a wrong number of labels",
@@ -440,17 +440,19 @@ def _aggregate(setup: Setup, state: TrainState, context: AggregateContext) -> Ag
 
 def _misfit(answer: AggregateResult, wanted: Mapping[str, Tensor]) -> str:
     """Return the reason why a result does not fit the trained tensors; empty if it fits."""
-    for part in (answer.gradients, answer.counts):
-        if not isinstance(part, Mapping):
-            return f"{type(part).__name__}, not a mapping of names"
+    for mapping in (answer.gradients, answer.counts):
+        if not isinstance(mapping, Mapping):
+            return f"{type(mapping).__name__}, not a mapping of names"
     if strange := wanted.keys() ^ answer.gradients.keys():
         return listed(f"{n} is {'missing' if n in wanted else 'unknown'}" for n in strange)
-    for name, found in answer.gradients.items():
-        if found is not None and not isinstance(found, Tensor):
-            return f"{name}: {type(found).__name__}"
+    for name, gradient in answer.gradients.items():
+        if gradient is not None and not isinstance(gradient, Tensor):
+            return f"{name}: {type(gradient).__name__}"
         shape, dtype = wanted[name].shape, wanted[name].dtype
-        if found is not None and (found.shape != shape or found.dtype != dtype):
-            return f"{name}: {list(found.shape)} of {found.dtype}, not {list(shape)} of {dtype}"
+        if gradient is not None and (gradient.shape != shape or gradient.dtype != dtype):
+            return (
+                f"{name}: {list(gradient.shape)} of {gradient.dtype}, not {list(shape)} of {dtype}"
+            )
     return ""
 
 
@@ -493,10 +495,12 @@ def _optimize(
     rates, rule = rates_at(setup, state.step), rule_at(setup, state.step)
     # Regularisation terms may give gradients to tensors that do not learn in this step.
     resting = setup.resting(state.step)
-    found = {name: coalesced(g) for name, g in gradients.items() if name not in resting}
+    learning = {name: coalesced(g) for name, g in gradients.items() if name not in resting}
     waiting = set(setup.sparse_rows.values())
-    sparse_rows = {n: g for n, g in found.items() if g is not None and g.is_sparse and n in waiting}
-    whole = {name: dense(g) for name, g in found.items() if name not in sparse_rows}
+    sparse_rows = {
+        n: g for n, g in learning.items() if g is not None and g.is_sparse and n in waiting
+    }
+    whole = {name: dense(g) for name, g in learning.items() if name not in sparse_rows}
     state.settle(name for name, g in whole.items() if g is not None)
     _take_adam_step(setup, state, whole, rates, rule, scale)
     _after_optimizer(setup, state)
@@ -516,15 +520,15 @@ def _take_adam_step(
     scale: Scale,
 ) -> None:
     """Take Adam's step of whole tensors; positions may step along the axes of their Gaussians."""
-    tensors, found = state.tensors, axes_of(setup)
-    if found is None or gradients.get(found[0]) is None:
+    tensors, names = state.tensors, axes_of(setup)
+    if names is None or gradients.get(names[0]) is None:
         adam_step(tensors, gradients, state.moments, rates, rule, scale.to_sum)
         return
-    name, *axes = found
+    name, *axes = names
     steps = torch.empty_like(tensors[name])
     moved = {**tensors, name: steps}
     adam_step(moved, gradients, state.moments, rates, rule, scale.to_sum, from_zero={name})
-    step_along_axes(tensors[name], steps, *(tensors[each] for each in axes))
+    step_along_axes(tensors[name], steps, *(tensors[axis] for axis in axes))
 
 
 def _densify(setup: Setup, state: TrainState, rendered: Rendered) -> tuple[Edit, bool]:

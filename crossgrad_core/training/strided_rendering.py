@@ -26,8 +26,8 @@ def stride_of(scale: float, camera: Camera) -> int:
 
 def corner_of(step: int, slot: int, stride: int) -> Corner:
     """Return the pseudo-random pixel of each n x n block that a step renders for `slot`."""
-    place = hash32(hash32(step) + slot) * stride * stride >> 32
-    return place % stride, place // stride
+    cell = hash32(hash32(step) + slot) * stride * stride >> 32
+    return cell % stride, cell // stride
 
 
 def camera_of(camera: Camera, stride: int, corner: Corner) -> Camera:

@@ -114,26 +114,26 @@ def weights_of(setup: Setup, state: TrainState, index: int, target: Target) -> T
     )
     hook = setup.hook.crossgrad_pixel_weights
     factors: list[object] = hook(context=context)
-    fitting = [_fitting(each, context, hook) for each in factors]
+    fitting = [_fitting(weights, context, hook) for weights in factors]
     return reduce(torch.mul, fitting) if fitting else None
 
 
 def _fitting(weights: object, context: PixelContext, hook: HookCaller) -> Tensor:
     """Return checked pixel weights; on a GPU only shape and type are checked, to avoid waiting."""
     shape = context.target.shape[:2]
-    found, least = type(weights).__name__, ""
+    description, least = type(weights).__name__, ""
     if isinstance(weights, Tensor):
-        found = f"{list(weights.shape)} of {weights.dtype}"
+        description = f"{list(weights.shape)} of {weights.dtype}"
         if weights.shape == shape and weights.is_floating_point():
             if not weights.is_cpu or bool(((weights >= 0) & (weights < inf)).all()):
                 return weights
             least = f", the least {float(weights.min()):g}"
-    who = listed(each.plugin_name for each in hook.get_hookimpls())
+    who = listed(implementation.plugin_name for implementation in hook.get_hookimpls())
     raise UserError(
         "a plugin returned invalid pixel weights",
         where=f"hook crossgrad_pixel_weights of {who}, photo {context.view.name}",
         expected=f"finite floating-point numbers of at least 0, with shape {list(shape)}",
-        found=f"{found}{least}",
+        found=f"{description}{least}",
         todo="repair the plugin, or run without it",
     )
 
@@ -186,7 +186,7 @@ def eval_background(setup: Setup) -> Tensor:
     """Return the background [3] RGB of evaluated views: black if the run's background is random."""
     name = setup.config.background
     named = {"black": (0.0, 0.0, 0.0), "random": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
-    rgb = named[name] if name in named else tuple(float(part) for part in name.split(","))
+    rgb = named[name] if name in named else tuple(float(level) for level in name.split(","))
     return torch.tensor(rgb, dtype=torch.float32).to(setup.device, non_blocking=True)
 
 
@@ -218,8 +218,10 @@ def _gradients_of(loss: Tensor, parameters: Mapping[str, Tensor], *, keep: bool)
     wanted = {name: t for name, t in parameters.items() if t.requires_grad}
     if not loss.requires_grad:
         return {}
-    found = torch.autograd.grad(loss, list(wanted.values()), retain_graph=keep, allow_unused=True)
-    return dict(zip(wanted, found, strict=True))
+    gradients = torch.autograd.grad(
+        loss, list(wanted.values()), retain_graph=keep, allow_unused=True
+    )
+    return dict(zip(wanted, gradients, strict=True))
 
 
 def _add(into: TensorGradients, more: Mapping[str, Tensor | None]) -> None:
@@ -307,7 +309,7 @@ def scales_of(setup: Setup, state: TrainState, draw: ViewSample) -> tuple[float,
     state.accept(answer.states, setup.hook.crossgrad_choose_scales)
     scales = answer.scales
     if len(scales) == len(draw.views) and all(
-        isinstance(each, Real) and 0.0 < each <= 1.0 for each in scales
+        isinstance(scale, Real) and 0.0 < scale <= 1.0 for scale in scales
     ):
         return tuple(map(float, scales))  # A checkpoint cannot contain NumPy numbers.
     raise UserError(
@@ -342,13 +344,13 @@ def render_views(
         else:
             total.add(gradients)
         state.laps.lap("backward")
-    known = _with_losses(state, records, losses)
+    with_losses = _with_losses(state, records, losses)
     state.counters.backward_passes += len(records)
     if not setup.separate:
-        return Rendered(known, regular, tuple(photos)), total
+        return Rendered(with_losses, regular, tuple(photos)), total
     # The separate gradients may be overwritten after their use, unless a plugin reads them.
     apart = DenseGradients(per_view, setup.trained_blocks, overwrite=not setup.watchers)
-    return Rendered(known, regular, tuple(photos)), apart
+    return Rendered(with_losses, regular, tuple(photos)), apart
 
 
 def _sums(setup: Setup, views: int) -> SummedGradients | DeferredSums:
@@ -399,13 +401,13 @@ def _together(
     state.laps.lap("render")
     pairs = zip(prepared, renders, strict=True)
     drawn = [_compare(setup, state, draw, view, render) for view, render in pairs]
-    for each in drawn:
-        _regularize_view(setup, state, each, regular)
+    for drawn_view in drawn:
+        _regularize_view(setup, state, drawn_view, regular)
     state.laps.lap("loss")
-    _backward(torch.stack([each.loss for each in drawn]).sum())
-    for each, copy in zip(drawn, copies, strict=True):
-        _pass_back(each.gaussians, copy)
-        yield each, _take(state.tensors)
+    _backward(torch.stack([drawn_view.loss for drawn_view in drawn]).sum())
+    for drawn_view, copy in zip(drawn, copies, strict=True):
+        _pass_back(drawn_view.gaussians, copy)
+        yield drawn_view, _take(state.tensors)
 
 
 def _leaf(tensor: Tensor) -> Tensor:

@@ -114,6 +114,6 @@ class Exposure(Component):
             scene: The scene.
             values: Name -> [P, ...] of the training photos.
         """
-        regimes = [each.regime for each in scene.train_views]
+        regimes = [photo.regime for photo in scene.train_views]
         rows = [row for row, regime in enumerate(regimes) if regime == view.regime]
-        return {name: each[rows or slice(None)].mean(dim=0) for name, each in values.items()}
+        return {name: of_all[rows or slice(None)].mean(dim=0) for name, of_all in values.items()}

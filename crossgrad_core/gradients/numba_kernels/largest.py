@@ -41,11 +41,11 @@ def largest_bits(
             tensor += 1
         size, first = sizes[tensor], (part - starts[tensor]) * PART
         bits = carray(float32_pointer(addresses[tensor]), size).view(np.uint32)
-        own = bits[first : min(size, first + PART)]
+        part_bits = bits[first : min(size, first + PART)]
         # Read four streams at a time, which waits less for memory than one stream.
-        quarter = len(own) // 4
-        p, q = own[:quarter], own[quarter : 2 * quarter]
-        r, s = own[2 * quarter : 3 * quarter], own[3 * quarter : 4 * quarter]
+        quarter = len(part_bits) // 4
+        p, q = part_bits[:quarter], part_bits[quarter : 2 * quarter]
+        r, s = part_bits[2 * quarter : 3 * quarter], part_bits[3 * quarter : 4 * quarter]
         of_p = of_q = of_r = of_s = np.uint32(0)
         for i in range(quarter):
             of_p = max(of_p, p[i] & _ALL_BUT_SIGN)
@@ -53,7 +53,7 @@ def largest_bits(
             of_r = max(of_r, r[i] & _ALL_BUT_SIGN)
             of_s = max(of_s, s[i] & _ALL_BUT_SIGN)
         most = max(of_p, of_q, of_r, of_s)
-        for i in range(4 * quarter, len(own)):
-            most = max(most, own[i] & _ALL_BUT_SIGN)
+        for i in range(4 * quarter, len(part_bits)):
+            most = max(most, part_bits[i] & _ALL_BUT_SIGN)
         found[part] = most
         part = next_job(jobs, parts)

@@ -42,9 +42,11 @@ def evaluate(
         UserError: For the reasons of `evaluated`, `evaluated_file` and `evaluated_on`.
     """
     if ply is not None:
-        result, gaussians, place = evaluated_file(folder, ply, how, on)
-        told = f"{gaussians:,} Gaussians of {ply}, rendered on black as viewers do"
-        print("\n".join([*metric_lines(result), told, *(place.messages() if place else ())]))  # noqa: T201
+        result, gaussians, capture = evaluated_file(folder, ply, how, on)
+        ply_line = f"{gaussians:,} Gaussians of {ply}, rendered on black as viewers do"
+        print(  # noqa: T201
+            "\n".join([*metric_lines(result), ply_line, *(capture.messages() if capture else ())])
+        )
     elif on is not None:
         result, there = evaluated_on(folder, on, how)
         print("\n".join([*metric_lines(result), *there.messages()]))  # noqa: T201

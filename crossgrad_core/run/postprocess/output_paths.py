@@ -23,9 +23,9 @@ def writing_if_possible(folder: Path, doing: str) -> Iterator[bool]:
         try:
             stack.enter_context(locked(folder, doing))
         except UserError as error:
-            found = f" ({error.found})" if error.found else ""
+            reason = f" ({error.found})" if error.found else ""
             _LOG.warning(
-                "%s%s: results are only shown, and none is written there", error.what, found
+                "%s%s: results are only shown, and none is written there", error.what, reason
             )
             yield False
         else:

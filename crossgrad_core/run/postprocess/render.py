@@ -54,13 +54,13 @@ def render(
         setup, state = how.open(folder)
         scene, draw, messages = setup.scene, renderer(setup, state), list[str]()
         views = {"test": scene.test_views, "train": scene.train_views, "all": scene.views}[split]
-        own = folder_of(folder, state.step) / ("accepted" if is_changed(setup) else "")
+        default_folder = folder_of(folder, state.step) / ("accepted" if is_changed(setup) else "")
         if on is not None:
             there, draw = elsewhere(setup, on), plain_renderer(setup, state)
             messages = there.messages()
             views = there.views
             if out is None:
-                own /= f"on_{name_for(folder, ending(there.name), on)}"
+                default_folder /= f"on_{name_for(folder, ending(there.name), on)}"
         if not views:
             raise UserError(
                 "there are no views to render",
@@ -68,11 +68,11 @@ def render(
                 todo="choose another --split: train, test or all",
             )
         writer = PanelWriter.of(folder, state.step, views, len(views))
-        writer = replace(writer, folder=out or own)
+        writer = replace(writer, folder=out or default_folder)
         if out is not None:
             check_new(*(out / f"{file}.png" for file in writer.files.values()))
         clear_leftovers(writer.folder, shared=True)
-        with relisted(folder, *(() if out else (_below(folder, own),))):
+        with relisted(folder, *(() if out else (_below(folder, default_folder),))):
             measured(views, draw, setup.metrics, on_view=writer.write)
         print("\n".join([*messages, f"{count(len(views), 'panel')} in {one_line(writer.folder)}"]))  # noqa: T201
 
@@ -114,21 +114,21 @@ def render_path(
         if out is not None:
             check_new(*(out / f"{number:05d}.png" for number in range(len(along.cameras))))
             clear_leftovers(out, shared=True)
-        draw, own = camera_renderer(setup, state), out is None
+        draw, is_default_folder = camera_renderer(setup, state), out is None
         if out is None:
             name = ending(along.name)
             name = name if path == ZOOM else name_for(folder, name, Path(path))
             out = folder_of(folder, state.step) / f"path_{name}"
-        with relisted(folder, *((_below(folder, out),) if own else ())):
+        with relisted(folder, *((_below(folder, out),) if is_default_folder else ())):
             with torch.no_grad():
                 files = write_frames(map(draw, along.cameras), out)
-            if own:
+            if is_default_folder:
                 drop_frames(out, len(files))
             made = write_video(files, along.fps)
-            for video in video_files(out) if own else ():
+            for video in video_files(out) if is_default_folder else ():
                 if video != made:  # Frames of another video exist.
                     video.unlink(missing_ok=True)
-        told = (
+        video_line = (
             f"video {made}"
             if made
             else (
@@ -136,8 +136,8 @@ def render_path(
                 f"without {ENCODER}"
             )
         )
-        print(f"{count(len(files), 'frame')} in {one_line(out)}, {one_line(told)}")  # noqa: T201
+        print(f"{count(len(files), 'frame')} in {one_line(out)}, {one_line(video_line)}")  # noqa: T201
 
 
-def _below(folder: Path, place: Path) -> str:
-    return place.relative_to(folder).as_posix()
+def _below(folder: Path, path: Path) -> str:
+    return path.relative_to(folder).as_posix()

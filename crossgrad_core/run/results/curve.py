@@ -107,13 +107,13 @@ def _literal(text: str) -> str:
 def _draw(ax: "Axes", rows: Sequence[Row], metric: str, lines: Sequence[_Line]) -> None:
     for line in reversed(lines):  # Draw `overall` on top.
         points = [(row["train_seconds"], row.get(f"{metric}{line.column}")) for row in rows]
-        known = [(x, y) for x, y in points if x is not None and y is not None and np.isfinite(y)]
+        measured = [(x, y) for x, y in points if x is not None and y is not None and np.isfinite(y)]
         ax.plot(
-            [x for x, _ in known],
-            [y for _, y in known],
+            [x for x, _ in measured],
+            [y for _, y in measured],
             label=line.label,
             color=line.color,
-            marker=line.marker if len(known) <= _MOST_MARKERS else "",
+            marker=line.marker if len(measured) <= _MOST_MARKERS else "",
             linestyle=line.style,
             linewidth=2.0 if line.column == "" else 1.5,
             markersize=4.5,
@@ -128,8 +128,11 @@ def _add_view_axis(ax: "Axes", rows: Sequence[Row]) -> None:
     """Add a second scale above the chart with rendered views at round numbers."""
     from matplotlib.ticker import MaxNLocator
 
-    known = [(row["train_seconds"], row["views"]) for row in rows]
-    pairs = [(0.0, 0.0), *((x, count) for x, count in known if x is not None and count is not None)]
+    counted = [(row["train_seconds"], row["views"]) for row in rows]
+    pairs = [
+        (0.0, 0.0),
+        *((x, count) for x, count in counted if x is not None and count is not None),
+    ]
     seconds, views = np.array(pairs, dtype=np.float64).T
     ticks = np.asarray(MaxNLocator(6, integer=True).tick_values(0.0, views[-1]))
     ticks = ticks[(ticks >= 0.0) & (ticks <= views[-1])]

@@ -114,8 +114,8 @@ def check_out(out: Path | None) -> None:
 def clear_half_written(folder: Path) -> None:
     """Delete half-written files of killed processes in the locked folder of a run."""
     renders = (path for path in (folder / RENDERS).rglob("*") if path.is_dir())
-    for place in (folder, folder / RENDERS, *renders):
-        clear_leftovers(place)
+    for directory in (folder, folder / RENDERS, *renders):
+        clear_leftovers(directory)
 
 
 def expected_bytes(primitives: int, checkpoints: int) -> int:

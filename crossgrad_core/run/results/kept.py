@@ -22,8 +22,10 @@ _REVISED: Final = frozenset({"steps", "revisions"})
 
 def kept_files(folder: Path) -> dict[str, Json]:
     """Return the texts of the files that a checkpoint stores, if they exist."""
-    found = {name: _content(folder / name) for name in (CONFIG, METRICS)}
-    return {name: text.decode(errors="replace") for name, text in found.items() if text is not None}
+    contents = {name: _content(folder / name) for name in (CONFIG, METRICS)}
+    return {
+        name: text.decode(errors="replace") for name, text in contents.items() if text is not None
+    }
 
 
 def restored(folder: Path, scalars: Mapping[str, Any], step: int) -> tuple[str, ...]:
@@ -38,13 +40,13 @@ def restored(folder: Path, scalars: Mapping[str, Any], step: int) -> tuple[str, 
         A note if the file was damaged.
     """
     text = (scalars.get(KEY) or {}).get(METRICS)
-    found = _content(folder / METRICS)
-    if text is None or found == text.encode():
+    present = _content(folder / METRICS)
+    if text is None or present == text.encode():
         return ()  # The file did not exist when the checkpoint was written, or it is complete.
     write_atomically(folder / METRICS, text.encode())
-    if found is not None and found.startswith(text.encode()):
+    if present is not None and present.startswith(text.encode()):
         return ()
-    was = "was gone" if found is None else "was damaged"
+    was = "was gone" if present is None else "was damaged"
     return (f"{METRICS} {was}: it is restored to its state at step {step}",)
 
 

@@ -80,7 +80,7 @@ class Machine:
         """
         if self._calibration is None and train_seconds >= WORTH_A_CALIBRATION:
             self._calibration = calibrated()
-        known = self._calibration
+        calibration = self._calibration
         loads = self._loads
         return {
             "load": {
@@ -89,7 +89,7 @@ class Machine:
             }
             if loads
             else None,
-            "calibration": None if known is None else dict(vars(known)),
+            "calibration": None if calibration is None else dict(vars(calibration)),
         }
 
 

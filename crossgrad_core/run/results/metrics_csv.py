@@ -63,7 +63,7 @@ def metrics_row(totals: Totals, result: EvaluationResult) -> Row:
             row[name] = round(value, digits)
     row |= result.overall.values
     for regime, means in result.regimes.items():
-        row |= {each.column(regime): means[each.name] for each in result.figures}
+        row |= {figure.column(regime): means[figure.name] for figure in result.figures}
     return {name: row[name] for name in columns_for(list(result.regimes), result.figures)}
 
 
@@ -109,8 +109,8 @@ class MetricsCsv:
         # A row that a crash cut short has fewer cells; the resumed run writes it again.
         whole = [line for line in lines[1:] if len(line) == len(table.columns)]
         steps = [row["step"] for row in _rows(path, lines[0], whole)]
-        known = zip(whole, steps, strict=True)
-        table.rewrite([line for line, at in known if at is not None and at <= step])
+        lines_and_steps = zip(whole, steps, strict=True)
+        table.rewrite([line for line, at in lines_and_steps if at is not None and at <= step])
         return table
 
     def append(self, row: Mapping[str, int | float | str | None]) -> None:
@@ -210,7 +210,7 @@ def write_per_view(folder: Path, result: EvaluationResult, name: str = PER_VIEW)
     """
     figures = [figure.name for figure in result.figures]
     lines = (
-        [view.name, view.regime, *(as_cell(view.values[each]) for each in figures)]
+        [view.name, view.regime, *(as_cell(view.values[figure_name]) for figure_name in figures)]
         for view in result.views
     )
     write_atomically(folder / name, csv_bytes([[*_NAMES, *figures], *lines]))

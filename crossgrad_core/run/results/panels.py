@@ -327,8 +327,8 @@ def _label(draw: "ImageDraw", layout: Layout, metrics: ViewMetrics, step: int) -
     ]
     render = f"render: {', '.join(figures)}" if figures else "render"
     for column, caption in enumerate(("photo", render, "error: mean |photo - render| of RGB")):
-        place = (layout.left(column), layout.captions)
-        draw.text(place, caption, fill=_INK, font=font, anchor="ls")
+        position = (layout.left(column), layout.captions)
+        draw.text(position, caption, fill=_INK, font=font, anchor="ls")
 
 
 def _color_bar(canvas: "Image", draw: "ImageDraw", layout: Layout) -> None:
@@ -343,8 +343,8 @@ def _color_bar(canvas: "Image", draw: "ImageDraw", layout: Layout) -> None:
         y = layout.top + round((1.0 - tick / LARGEST_ERROR) * (layout.height - 1))
         draw.line((right, y, right + layout.font // 3, y), fill=_FAINT)
         text = f"\u2265 {tick:.2f}" if tick == LARGEST_ERROR else f"{tick:.2f}"
-        place = (right + layout.font // 2, y)
-        draw.text(place, text, fill=_FAINT, font=font, anchor="lm")
+        position = (right + layout.font // 2, y)
+        draw.text(position, text, fill=_FAINT, font=font, anchor="lm")
 
 
 def _mask_key(canvas: "Image", draw: "ImageDraw", layout: Layout) -> None:

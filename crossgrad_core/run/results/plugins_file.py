@@ -44,13 +44,13 @@ _PACKAGES: Final = TypeAdapter(Packages)
 
 def packages_of(setup: Setup) -> Packages:
     """Return the packages of all components of a run, including nested components."""
-    found = [installed_as(type(part)) for part in _parts(setup.plugins)]
-    found.append(entries("readers").get(setup.selection.names["reader"]))
+    installed = [installed_as(type(component)) for component in _parts(setup.plugins)]
+    installed.append(entries("readers").get(setup.selection.names["reader"]))
     packages = {OURS: Package(versions=(VERSION,))}
-    foreign = [each for each in found if each is not None and each.distribution != OURS]
+    foreign = [entry for entry in installed if entry is not None and entry.distribution != OURS]
     for entry in foreign:
-        same = [each for each in foreign if each.distribution == entry.distribution]
-        components = tuple(sorted({_described(each) for each in same}))
+        same = [other for other in foreign if other.distribution == entry.distribution]
+        components = tuple(sorted({_described(other) for other in same}))
         packages[entry.distribution] = Package(versions=(entry.version,), components=components)
     return packages
 
@@ -130,7 +130,7 @@ def refuse_missing(
     gone = {
         name: lost
         for name, package in (packages or {}).items()
-        if (lost := [each for each in package.components if _lacks(each, optional)])
+        if (lost := [component for component in package.components if _lacks(component, optional)])
     }
     if gone and packages:
         named = {name: f"{name}=={packages[name].versions[-1]}" for name in gone}
@@ -145,17 +145,19 @@ def refuse_missing(
 
 def changes(packages: Packages | None) -> dict[str, str]:
     """Return the packages whose version differs from the version that trained last: then -> now."""
-    found = {}
+    changed = {}
     for name, package in (packages or {}).items():
         was = f"{name} {package.versions[-1]}"
         if name == OURS:
             now = {f"{OURS} {VERSION}"}
         else:
-            present = (_entry(each) for each in package.components)
-            now = {f"{each.distribution} {each.version}" for each in present if each is not None}
+            present = (_entry(component) for component in package.components)
+            now = {
+                f"{entry.distribution} {entry.version}" for entry in present if entry is not None
+            }
         if now - {was}:
-            found[was] = listed(sorted(now))
-    return found
+            changed[was] = listed(sorted(now))
+    return changed
 
 
 def refuse_changed(folder: Path, packages: Packages | None) -> None:
@@ -192,8 +194,8 @@ def _parts(value: object) -> Iterator[Component]:
         inner = value.values()
     elif isinstance(value, list | tuple):
         inner = value
-    for each in inner:
-        yield from _parts(each)
+    for item in inner:
+        yield from _parts(item)
 
 
 def _described(entry: Entry) -> str:

@@ -79,11 +79,11 @@ def check_scene(
         UserError: The scene differs by more than is tolerated, or the user did not accept it.
     """
     was = read_scene_file(folder)
-    found = [] if was is None else differences(was, now)
-    if not found:
+    changed = [] if was is None else differences(was, now)
+    if not changed:
         return ()
-    text = "; ".join(each.text for each in found)
-    heaviest = max(each.weight for each in found)
+    text = "; ".join(difference.text for difference in changed)
+    heaviest = max(difference.weight for difference in changed)
     if heaviest <= tolerated and accept:
         return (f"{ACCEPTED}{text}",)
     raise UserError(

@@ -26,6 +26,6 @@ def seal(folder: Path) -> None:
 
 def _final_files(folder: Path) -> Iterator[Path]:
     for path in folder.rglob("*"):
-        own = path.relative_to(folder).parts[0]
-        if path.is_file() and own not in _UNSEALED and not is_leftover(path):
+        top_name = path.relative_to(folder).parts[0]
+        if path.is_file() and top_name not in _UNSEALED and not is_leftover(path):
             yield path

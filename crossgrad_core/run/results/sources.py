@@ -27,21 +27,21 @@ def name_for(folder: Path, name: str, source: Path) -> str:
     Raises:
         UserError: The disk is full.
     """
-    known, place = _known(folder), str(source.resolve())
+    source_by_name, source_path = _known(folder), str(source.resolve())
     taken, number = name, 1
-    while taken in RESERVED or known.get(taken, place) != place:
+    while taken in RESERVED or source_by_name.get(taken, source_path) != source_path:
         number += 1
         taken = f"{name}-{number}"
-    if taken not in known:
-        content = dumps({**known, taken: place}, indent=1, ensure_ascii=False)
+    if taken not in source_by_name:
+        content = dumps({**source_by_name, taken: source_path}, indent=1, ensure_ascii=False)
         write_atomically(folder / FILE, text_bytes(f"{content}\n"))
     return taken
 
 
 def _known(folder: Path) -> dict[str, str]:
     try:
-        found = read_json(folder / FILE)
+        content = read_json(folder / FILE)
     except (FileNotFoundError, ValueError):
         return {}
-    pairs = found.items() if isinstance(found, dict) else ()
-    return {str(name): place for name, place in pairs if isinstance(place, str)}
+    pairs = content.items() if isinstance(content, dict) else ()
+    return {str(name): source_path for name, source_path in pairs if isinstance(source_path, str)}

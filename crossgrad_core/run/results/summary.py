@@ -119,13 +119,15 @@ def _as_data(summary: Summary) -> dict[str, Any]:
         **_metrics(summary.result),
         "best": best_of(summary.rows),
         "ply": None if summary.ply is None else dict(summary.ply),
-        "seconds": {name: each for name, each in asdict(summary.seconds).items() if name != "cpu"},
+        "seconds": {
+            name: value for name, value in asdict(summary.seconds).items() if name != "cpu"
+        },
         "seed": summary.config.get("seed"),
         "notes": list(summary.notes),
         "decisions": [asdict(row) for row in summary.decisions],
         "scene_check": None if summary.check is None else dict(summary.check),
         "definitions": _definitions(figures),
-        "falling": [each.name for each in figures if each.falls],
+        "falling": [figure.name for figure in figures if figure.falls],
         "environment": dict(summary.environment),
         "config": dict(summary.config),
     }
@@ -142,7 +144,7 @@ def _metrics(result: EvaluationResult | None) -> dict[str, Any]:
 
 
 def _definitions(figures: Sequence[Figure]) -> dict[str, str]:
-    stated = {each.name: each.definition for each in figures if each.definition}
+    stated = {figure.name: figure.definition for figure in figures if figure.definition}
     return {**stated, "renders": RENDERS}
 
 
@@ -194,7 +196,9 @@ def cost_line(totals: Totals) -> str:
 
 def _rows(result: EvaluationResult) -> list[tuple[str, ...]]:
     # A metric that is not defined for these views gets no column.
-    shown = [each for each in result.figures if result.reasons.get(each.name) != each.undefined]
+    shown = [
+        figure for figure in result.figures if result.reasons.get(figure.name) != figure.undefined
+    ]
     header = ("", "views", *(figure.label for figure in shown))
     rows = [header, _row("overall", result.overall, shown)]
     # A single regime would only repeat the first row.
@@ -214,8 +218,8 @@ def _number(value: float | None, form: str) -> str:
 
 def _shown(result: EvaluationResult) -> list[tuple[str, str]]:
     """Return reasons for missing metrics, only for metrics that are reported by regime."""
-    told = [figure.name for figure in result.figures if figure.per_regime]
-    return [(name, why) for name, why in result.reasons.items() if name in told]
+    reported_by_regime = [figure.name for figure in result.figures if figure.per_regime]
+    return [(name, why) for name, why in result.reasons.items() if name in reported_by_regime]
 
 
 def _aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:

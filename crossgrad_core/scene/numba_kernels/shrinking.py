@@ -41,15 +41,15 @@ def _filter_columns(
     height, width = image.shape
     for left in range(0, width, _BLOCK):
         right = min(left + _BLOCK, width)
-        part, row = line[left:right], image[y, left:right]
-        for x in range(part.size):
-            part[x] = row[x] * weights[0]
+        segment, row = line[left:right], image[y, left:right]
+        for x in range(segment.size):
+            segment[x] = row[x] * weights[0]
         for distance in range(weights.size - 1, 0, -1):
             above = image[_mirrored(y - distance, height), left:right]
             below = image[_mirrored(y + distance, height), left:right]
-            _add_pair(above, below, weights[distance], part)
-        for x in range(part.size):
-            part[x] = np.float32(part[x])
+            _add_pair(above, below, weights[distance], segment)
+        for x in range(segment.size):
+            segment[x] = np.float32(segment[x])
 
 
 @strict_device
@@ -77,18 +77,18 @@ def _filter_row(
             at = border + (width - 1 + beyond) * channels + channel
             padded[at] = row[right * channels + channel]
     for begin in range(0, result.size, _BLOCK):
-        part = result[begin : begin + _BLOCK]
+        segment = result[begin : begin + _BLOCK]
         middle = row[begin : begin + _BLOCK]
-        for x in range(part.size):
-            part[x] = middle[x] * weights[0]
+        for x in range(segment.size):
+            segment[x] = middle[x] * weights[0]
         for distance in range(weights.size - 1, 0, -1):
             shift, weight = distance * channels, weights[distance]
-            before = padded[border + begin - shift : border + begin - shift + part.size]
-            after = padded[border + begin + shift : border + begin + shift + part.size]
-            for x in range(part.size):
-                part[x] += (before[x] + after[x]) * weight
-        for x in range(part.size):
-            part[x] = np.float32(part[x])
+            before = padded[border + begin - shift : border + begin - shift + segment.size]
+            after = padded[border + begin + shift : border + begin + shift + segment.size]
+            for x in range(segment.size):
+                segment[x] += (before[x] + after[x]) * weight
+        for x in range(segment.size):
+            segment[x] = np.float32(segment[x])
 
 
 @strict_device

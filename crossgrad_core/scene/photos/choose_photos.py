@@ -121,16 +121,16 @@ def choose_photos(raw: RawScene, options: SceneOptions) -> ChosenPhotos:
     folders = find_photo_folders(raw.images)[: 1 if raw.images == raw.root else None]
     names = sorted(view.name for view in raw.views)
     full = _read_full(folders[0], names)
-    found, reduced_notes = _prefer_reduced(full, folders[1:], options.max_size)
-    masks = _find_masks(raw, options, tuple(found.paths))
-    white, white_notes = white_of([found.paths[n] for n, h in found.headers.items() if h.deep])
+    chosen, reduced_notes = _prefer_reduced(full, folders[1:], options.max_size)
+    masks = _find_masks(raw, options, tuple(chosen.paths))
+    white, white_notes = white_of([chosen.paths[n] for n, h in chosen.headers.items() if h.deep])
     sources: dict[str, PhotoSource] = {}
     pinholes: dict[str, Pinhole] = {}
     shared: dict[Calibration, Calibration] = {}
     for view in raw.views:
-        if view.name not in found.paths:
+        if view.name not in chosen.paths:
             continue
-        path, header = found.paths[view.name], found.headers[view.name]
+        path, header = chosen.paths[view.name], chosen.headers[view.name]
         reduction = choose_reduction(path, header, options.max_size)
         header = header.reduced(reduction)
         width, height, orientation = _fit(view.calibration, header, path)
@@ -155,17 +155,17 @@ def choose_photos(raw: RawScene, options: SceneOptions) -> ChosenPhotos:
     for name, mask in masks.items():
         source = sources[name]
         check_mask(mask, (source.width, source.height), may_turn=source.orientation != 1)
-    used = [*full.paths.values(), *found.paths.values(), *masks.values()]
+    used = [*full.paths.values(), *chosen.paths.values(), *masks.values()]
     started = [options.init_file] if options.init_file else []
     notes = (
         *note_pairing(full.folder, full.paths, names, used),
         *note_links(raw.root, sources),
         *reduced_notes,
         *note_undistortion(sources),
-        *note_sizes(found.folder.path.name, sources, _calibrated_sizes(raw)),
+        *note_sizes(chosen.folder.path.name, sources, _calibrated_sizes(raw)),
         *note_reductions(sources),
         *white_notes,
-        *note_kinds(sources, found.headers, raw.background),
+        *note_kinds(sources, chosen.headers, raw.background),
         *note_memory(sources, options),
         *note_unused(raw, [*used, *started], find_mask_folder(options.masks, raw.root)),
     )
@@ -216,9 +216,9 @@ def _prefer_reduced(
                 f"{count(len(absent), 'photo')}: {name_some(absent)}"
             )
             continue
-        found = _read_found(folder, paths)
-        if found.longest <= max_size:
-            return (found if 2 * found.longest >= max_size else full), notes
+        candidate = _read_found(folder, paths)
+        if candidate.longest <= max_size:
+            return (candidate if 2 * candidate.longest >= max_size else full), notes
     return full, notes
 
 
@@ -256,8 +256,8 @@ def _limit(width: int, height: int, max_size: int | None) -> tuple[int, int]:
 
 def _find_masks(raw: RawScene, options: SceneOptions, names: Sequence[str]) -> dict[str, Path]:
     folder = find_mask_folder(options.masks, raw.root)
-    found = frozenset(names)
-    named = {view.name: view.mask for view in raw.views if view.mask and view.name in found}
+    with_photo = frozenset(names)
+    named = {view.name: view.mask for view in raw.views if view.mask and view.name in with_photo}
     if folder is None or (named and options.masks is None):
         return named
     masks = pair_masks(folder, names)

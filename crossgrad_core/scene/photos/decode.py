@@ -191,7 +191,7 @@ def _read_mask(image: "Image") -> NDArray[np.int32]:
     """Read grey [H, W], or alpha if alpha varies and the colours are not black and white."""
     if image.mode.startswith("I") or not pillow.has_alpha(image):
         return _read_grey(image)
-    grey, alpha = (np.array(part).astype(np.int32) for part in image.convert("LA").split())
+    grey, alpha = (np.array(band).astype(np.int32) for band in image.convert("LA").split())
     if alpha.min() == alpha.max() or _is_black_and_white(grey):
         return grey
     return alpha

@@ -77,7 +77,7 @@ class FileNames:
     ) -> None:
         self._aside = aside
         self._called = {name: called(name) for name in sorted(names)}
-        self._folders = {part for name in self._called for part in _folders(name)}
+        self._folders = {folder for name in self._called for folder in _folders(name)}
         self._alike = defaultdict[str, list[str]](list)
         for name, call in self._called.items():
             self._alike[_base(without_suffix(call))].append(name)
@@ -126,28 +126,34 @@ class FileNames:
         self, name: str, is_taken: Callable[[str], bool]
     ) -> tuple[_Likeness, list[str]]:
         """Return the files that are most similar to a name, and their similarity."""
-        found: dict[str, _Likeness] = {}
+        likeness_by_file: dict[str, _Likeness] = {}
         for base in {_base(name), _stem(name)}:
             for file in self._alike.get(base, ()):
                 likeness = None if is_taken(file) else self._likeness(name, file)
                 if likeness is not None:
-                    found[file] = likeness
-        most = max(found.values(), default=(False, 0, False, False, False))
-        return most, [file for file, likeness in found.items() if likeness == most]
+                    likeness_by_file[file] = likeness
+        most = max(likeness_by_file.values(), default=(False, 0, False, False, False))
+        return most, [file for file, likeness in likeness_by_file.items() if likeness == most]
 
     def _likeness(self, name: str, file: str) -> _Likeness | None:
         """Return the similarity of a file's path to a name; None if the name's folder exists."""
         call = self._called[file]
-        own, other = _folders(name), _folders(call)
-        pairs = zip(reversed(own), reversed(other), strict=False)
+        name_folders, file_folders = _folders(name), _folders(call)
+        pairs = zip(reversed(name_folders), reversed(file_folders), strict=False)
         shared = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
-        ends = shared in {len(own), len(other)}
-        missing = shared < len(own) and own[-1 - shared] in self._folders
-        if own != other and (missing or self._aside(file)):
+        ends = shared in {len(name_folders), len(file_folders)}
+        missing = shared < len(name_folders) and name_folders[-1 - shared] in self._folders
+        if name_folders != file_folders and (missing or self._aside(file)):
             return None
         # A name without a suffix may contain dots.
         whole = _base(name) in {_base(call), _base(without_suffix(call))}
-        return own == other, shared, ends, whole, _parts(name)[-1] == _parts(call)[-1]
+        return (
+            name_folders == file_folders,
+            shared,
+            ends,
+            whole,
+            _parts(name)[-1] == _parts(call)[-1],
+        )
 
 
 def is_absolute(name: str) -> bool:
@@ -171,7 +177,7 @@ def _parts(name: str) -> list[str]:
 
 
 def _folders(name: str) -> list[str]:
-    return [_fold(part) for part in _parts(name)[:-1]]
+    return [_fold(folder) for folder in _parts(name)[:-1]]
 
 
 def _base(name: str) -> str:

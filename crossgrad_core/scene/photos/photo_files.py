@@ -94,7 +94,7 @@ def walked(folder: Path) -> Iterator[tuple[str, list[str], list[str]]]:
     for below, folders, files in _tree(folder, folder, seen):
         yield below, folders, files
         places = (folder / below / name for name in sorted(folders))
-        links += [place for place in places if place.is_symlink()]
+        links += [path for path in places if path.is_symlink()]
     for link in links:
         if link.resolve() not in folder.resolve().parents:
             yield from _tree(folder, link, seen)
@@ -102,11 +102,11 @@ def walked(folder: Path) -> Iterator[tuple[str, list[str], list[str]]]:
 
 def _tree(folder: Path, start: Path, seen: set[str]) -> Iterator[tuple[str, list[str], list[str]]]:
     for base, folders, files in os.walk(start):
-        place = os.path.realpath(base)
-        if place in seen:
+        real_path = os.path.realpath(base)
+        if real_path in seen:
             folders.clear()
             continue
-        seen.add(place)
+        seen.add(real_path)
         yield Path(base).relative_to(folder).as_posix(), folders, files
 
 
@@ -131,7 +131,7 @@ def mask_names(name: str) -> tuple[str, ...]:
 
 def find_mask(folder: Path, name: str) -> Path | None:
     """Return the mask of a photo; None without a mask."""
-    return next(filter(is_file, (folder / each for each in mask_names(name))), None)
+    return next(filter(is_file, (folder / mask_name for mask_name in mask_names(name))), None)
 
 
 def pair_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
@@ -222,19 +222,21 @@ def with_photo_names(raw: RawScene) -> RawScene:
     pairs = find_photo_folders(raw.images)[0].pair(names)
     _check_absolute(raw, pairs.ambiguous)
     moved = {name: file for name, file in pairs.files.items() if not same_spelling(name, file)}
-    told = (
+    groups = (
         (moved, "found by the end of their path", "{0} is {1}"),
         (pairs.ambiguous, "without a photo: their name matches several photos", "{0} ({1})"),
     )
     notes = [
         f"photos: {count(len(which), 'posed image')} {what}: "
         + name_some([form.format(name, _listed(files)) for name, files in sorted(which.items())])
-        for which, what, form in told
+        for which, what, form in groups
         if which
     ]
     views = tuple(replace(view, name=moved.get(view.name, view.name)) for view in raw.views)
     if raw.split is not None:
-        train, test = (frozenset(moved.get(name, name) for name in part) for part in raw.split)
+        train, test = (
+            frozenset(moved.get(name, name) for name in split_names) for split_names in raw.split
+        )
         raw = replace(raw, split=(train, test))
     return replace(raw, views=views, notes=(*raw.notes, *notes))
 

@@ -34,18 +34,18 @@ def note_pairing(
 ) -> list[str]:
     """Note posed images without a photo, photos without a pose, and names spelled differently."""
     absent = [name for name in names if name not in paths]
-    known = frozenset(used)
-    others = [name for name in folder.names if folder.path / name not in known]
+    used_paths = frozenset(used)
+    others = [name for name in folder.names if folder.path / name not in used_paths]
     spare = [name for name in others if kind_of(name) is PHOTO]
     renamed = [name for name, path in paths.items() if path != folder.path / name]
-    told = (
+    groups = (
         (absent, "posed image", "left out, because the photo is missing"),
         (spare, "photo", "left out (no pose)"),
         (renamed, "photo", "matched with a photo whose suffix or case differs"),
     )
     return [
         f"photos: {count(len(which), noun)} {what}: {name_some(which)}"
-        for which, noun, what in told
+        for which, noun, what in groups
         if which
     ]
 
@@ -53,7 +53,7 @@ def note_pairing(
 def note_links(root: Path, sources: Sources) -> list[str]:
     """Note photos and masks that are stored outside the scene's folder."""
     home = os.path.join(os.path.realpath(root), "")
-    files = [file for each in sources.values() for file in (each.path, each.mask) if file]
+    files = [file for source in sources.values() for file in (source.path, source.mask) if file]
     outside = [file for file in files if not os.path.realpath(file).startswith(home)]
     if not outside:
         return []
@@ -79,9 +79,9 @@ def note_undistortion(sources: Sources) -> list[str]:
 def _costs(sources: Sources) -> list[str]:
     """Note the losses of undistortion for lenses that fold over or are wider than a pinhole."""
     lenses = [source.distorted for source in sources.values() if source.distorted is not None]
-    found = [(lens, cost) for lens in lenses if (cost := lens.cost) is not None]
-    folded = [(lens.model, cost.beyond) for lens, cost in found if cost.beyond > 0.0]
-    wide = [cost for _, cost in found if cost.lost >= _WORTH_A_NOTE]
+    lens_costs = [(lens, cost) for lens in lenses if (cost := lens.cost) is not None]
+    folded = [(lens.model, cost.beyond) for lens, cost in lens_costs if cost.beyond > 0.0]
+    wide = [cost for _, cost in lens_costs if cost.lost >= _WORTH_A_NOTE]
     notes = []
     if folded:
         models = listed(sorted({model for model, _ in folded}))
@@ -147,7 +147,7 @@ def note_kinds(
     """Note the numbers of turned, transparent, grey and masked photos."""
     total = len(sources)
     over = f"blended over RGB {background}" if background else "pixels with alpha < 0.5 are ignored"
-    told = (
+    counted = (
         (
             sum(s.orientation != 1 for s in sources.values()),
             "photos",
@@ -168,7 +168,7 @@ def note_kinds(
     bare = [name for name, source in sorted(sources.items()) if source.mask is None]
     missing = f"{len(bare)} of {total} have none, and all their pixels are used: {name_some(bare)}"
     return [
-        *(f"{topic}: {number} of {total} {what}" for number, topic, what in told if number),
+        *(f"{topic}: {number} of {total} {what}" for number, topic, what in counted if number),
         *([f"masks: {missing}"] if bare and len(bare) < total else []),
     ]
 
@@ -216,12 +216,12 @@ def note_unused(raw: RawScene, used: Iterable[Path], masks: Path | None) -> list
 
 def _unused(raw: RawScene, used: Iterable[Path], masks: Path | None) -> dict[str, str]:
     """Return the files that are not used, directly or through links, with the reasons."""
-    known, home = set(map(os.path.abspath, used)), os.path.abspath(raw.root)
-    files = [name for name in _files(raw.root) if os.path.join(home, name) not in known]
+    used_paths, home = set(map(os.path.abspath, used)), os.path.abspath(raw.root)
+    files = [name for name in _files(raw.root) if os.path.join(home, name) not in used_paths]
     reasons = {name: reason for name in files if (reason := _reason(name, raw, masks))}
     if not reasons:
         return {}
-    true = set(map(os.path.realpath, known))
+    true = set(map(os.path.realpath, used_paths))
     return {
         name: reason
         for name, reason in reasons.items()
@@ -251,12 +251,12 @@ def _reason(name: str, raw: RawScene, masks: Path | None) -> str | None:
     if kind is MASK:
         return "files whose names look like masks; use them with --set data.masks=FOLDER"
     if kind is POINTS:
-        own = (
+        explanation = (
             "the scene has its own points"
             if len(raw.points)
             else "the reader does not look for this name"
         )
-        return f"{own}; start from such a file with --points FILE"
+        return f"{explanation}; start from such a file with --points FILE"
     return {
         RAW: "raw files of a camera; save the photos as JPEG or PNG to use them",
         DEPTH: "depth and normal maps are not used",

@@ -107,11 +107,11 @@ class PhotoStore:
         if origin is None:
             return source.decode()
         path = self._path(origin)
-        found = _read(path, *source.target, self._sound.get(path))
-        if found is not None:
+        stored = _read(path, *source.target, self._sound.get(path))
+        if stored is not None:
             with suppress(OSError):
                 self._touch(path, path)
-            return found
+            return stored
         decoded = source.decode()
         if self._open:
             self._keep(path, _packed(decoded))
@@ -124,7 +124,7 @@ class PhotoStore:
         temporary = path.with_name(f"{path.stem}.{os.getpid()}.{next(_NUMBER)}{_TEMPORARY}")
         try:
             self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            size = sum(len(part) for part in content)
+            size = sum(len(chunk) for chunk in content)
             if not self._has_room(size):
                 self._close("its limit is reached, or the disk is full")
                 return
@@ -172,10 +172,10 @@ class PhotoStore:
 
 def _entries(folder: Path) -> Iterator[tuple[float, int, Path]]:
     """Yield time of last use, bytes and path of each entry; deletes files of killed processes."""
-    with os.scandir(folder) as found:
-        for each in found:
+    with os.scandir(folder) as listing:
+        for entry in listing:
             with suppress(OSError):
-                facts, path = each.stat(), Path(each.path)
+                facts, path = entry.stat(), Path(entry.path)
                 if path.suffix == _KEPT:
                     yield facts.st_mtime, facts.st_size, path
                 elif path.suffix == _TEMPORARY and facts.st_mtime < time() - _STALE:

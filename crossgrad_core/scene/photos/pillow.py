@@ -128,8 +128,8 @@ def rows_of(image: "Image", top: int, end: int) -> bytes:
     """Return the pixels of some rows of an opened photo; decodes the photo if needed."""
     image.load()
     with _LOCK:  # Pillow checks its pixel limit here, too.
-        part = image.crop((0, top, image.width, end))
-    return part.tobytes()
+        strip = image.crop((0, top, image.width, end))
+    return strip.tobytes()
 
 
 def _check_pixels(image: "Image", path: Path) -> None:
@@ -142,9 +142,9 @@ def _identified(file: BinaryIO, path: Path) -> "Image":
     from PIL import Image
 
     Image.init()
-    known = (*_FORMATS, "HEIF") if admit(file.read(HEAD), path) else _FORMATS
+    allowed = (*_FORMATS, "HEIF") if admit(file.read(HEAD), path) else _FORMATS
     file.seek(0)
-    formats = [name for name in known if name in Image.OPEN]
+    formats = [name for name in allowed if name in Image.OPEN]
     with _LOCK:  # Pillow's limit is a global, and photos are decoded in several threads.
         bound, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
         try:

@@ -114,9 +114,9 @@ def _far_points(points: Floats, centers: Floats) -> Iterator[str]:
 def _unusual(sketches: Sketches, names: Sequence[str]) -> Iterator[str]:
     sharpness = sketches.sharpness
     light = np.log2(sketches.light + 1.0) * 2.2
-    known = np.isfinite(sharpness)
-    if known.any():
-        low = known & (sharpness < _BLURRED * np.median(sharpness[known]))
+    has_sharpness = np.isfinite(sharpness)
+    if has_sharpness.any():
+        low = has_sharpness & (sharpness < _BLURRED * np.median(sharpness[has_sharpness]))
         if low.any():
             yield f"check: {_listed(low, names)} much less sharp than the other photos"
     off = np.abs(light - np.median(light)) > _STOPS
@@ -230,38 +230,38 @@ def _word(verdict: Verdict) -> str:
 
 
 def _warnings(scene: Scene, verdict: Verdict, undecoded: Sequence[str]) -> list[str]:
-    told = []
+    messages = []
     if undecoded:
-        told.append(
+        messages.append(
             f"check: {count(len(undecoded), 'photo')} left out, because they cannot be "
             f"decoded: {name_some(undecoded)}"
         )
     if verdict.all_wrong is not None:
-        told.append(
+        messages.append(
             f"check: points, poses and photos do not match, accepted: {verdict.all_wrong.what}"
         )
     for cause in verdict.some_wrong:
         names = [scene.views[view].name for view in cause.views]
-        told.append(
+        messages.append(
             f"check: {count(len(names), 'photo')} not matching the points: "
             f"{name_some(names)}; {cause.what}: {cause.todo}"
         )
-    return told
+    return messages
 
 
 def _refusal(verdict: Verdict, cause: Cause, path: Path) -> UserError:
-    found = []
+    evidence = []
     if isfinite(verdict.in_frame):
-        found.append(f"{verdict.in_frame:.0%} of the observed points are inside the photos")
+        evidence.append(f"{verdict.in_frame:.0%} of the observed points are inside the photos")
     if isfinite(verdict.correlation):
-        found.append(
+        evidence.append(
             f"the colours of points and photos have a correlation of {verdict.correlation:.2f}"
         )
     return UserError(
         "the photos of the scene do not match its poses and points",
         where=path,
         expected="photos that show the SfM points at the positions that the poses predict",
-        found=f"{cause.what} ({', '.join(found)})" if found else cause.what,
+        found=f"{cause.what} ({', '.join(evidence)})" if evidence else cause.what,
         todo=f"{cause.todo}; or train on the scene unchanged with --accept-scene, or with "
         "data.accept_scene: true in a settings file",
     )

@@ -136,16 +136,18 @@ class Bench:
         first, *others = [probe.change(evidence.rig) for probe in probes()]
         rows = np.tile(evidence.rows, (1 + len(others), 1))
         agreement = replace(evidence, rows=rows).agreement(first.joined(others))
-        each = scores(agreement, tracked=evidence.tracked).reshape(1 + len(others), -1).mean(axis=1)
-        return bool(each.max() > self.before + _PROBED)
+        mean_scores = (
+            scores(agreement, tracked=evidence.tracked).reshape(1 + len(others), -1).mean(axis=1)
+        )
+        return bool(mean_scores.max() > self.before + _PROBED)
 
     def diagnosis(self) -> Diagnosis:
         """Return the change with the best score; likely changes are tried first."""
-        found = self.best(likely())
-        if not found.repairs:
+        best = self.best(likely())
+        if not best.repairs:
             for search in searches():
-                found = _better(found, *self._searched(search))
-        return found if found.repairs else self.best(other_axes(), found)
+                best = _better(best, *self._searched(search))
+        return best if best.repairs else self.best(other_axes(), best)
 
     def best(self, trials: Iterable[Trial], found: Diagnosis | None = None) -> Diagnosis:
         """Return the best of some trials, or `found` if no trial is better."""
@@ -167,8 +169,8 @@ class Bench:
         return score, search.trial(best)
 
 
-def _better(found: Diagnosis, score: float, trial: Trial) -> Diagnosis:
-    return Diagnosis(found.before, score, trial) if score > found.after + _CLEARLY else found
+def _better(best: Diagnosis, score: float, trial: Trial) -> Diagnosis:
+    return Diagnosis(best.before, score, trial) if score > best.after + _CLEARLY else best
 
 
 def turns() -> Iterator[Trial]:
@@ -270,9 +272,9 @@ def _inverted() -> Iterator[Trial]:
     """Yield trials for poses that are inverse, completely or in part."""
     cause = "the poses are camera-to-world, but world-to-camera is expected"
     todo = "invert the 4 x 4 matrix of each pose in the model"
-    for own, text in ((np.eye(3), ""), (_FLIP, ", in OpenGL axes")):
+    for camera_axes, text in ((np.eye(3), ""), (_FLIP, ", in OpenGL axes")):
         for world in (np.eye(3), _FLIP):
-            yield Trial(f"{cause}{text}", todo, _inverse(own, world))
+            yield Trial(f"{cause}{text}", todo, _inverse(camera_axes, world))
     yield Trial(
         "the rotations of the poses are camera-to-world, but world-to-camera is expected",
         "transpose the rotation of each pose in the model",
@@ -301,10 +303,10 @@ def _inverted() -> Iterator[Trial]:
         )
 
 
-def _inverse(own: Floats, world: Floats) -> Change:
+def _inverse(camera_axes: Floats, world: Floats) -> Change:
     def change(rig: Rig) -> Rig:
-        rotations = (own @ rig.rotations).transpose(0, 2, 1)
-        translations = -np.einsum("vij,vj->vi", rotations, rig.translations @ own.T)
+        rotations = (camera_axes @ rig.rotations).transpose(0, 2, 1)
+        translations = -np.einsum("vij,vj->vi", rotations, rig.translations @ camera_axes.T)
         rig = replace(rig, rotations=rotations, translations=translations)
         return _with_axes(world)(rig)
 

@@ -70,15 +70,15 @@ class Rig:
     def of(cls, scene: Scene) -> "Rig":
         """Make the rig of a scene."""
         cameras = [view.camera for view in scene.views]
-        poses = np.stack([each.world_to_camera.numpy() for each in cameras])
+        poses = np.stack([camera.world_to_camera.numpy() for camera in cameras])
         rotations = poses[:, :3, :3]
         centers = scene.similarity.to_input(-np.einsum("vji,vj->vi", rotations, poses[:, :3, 3]))
         return cls(
             rotations=rotations,
             translations=-np.einsum("vij,vj->vi", rotations, centers),
-            focal=np.array([[each.fx, each.fy] for each in cameras]),
-            principal=np.array([[each.cx, each.cy] for each in cameras]),
-            sizes=np.array([[each.width, each.height] for each in cameras], dtype=np.float64),
+            focal=np.array([[camera.fx, camera.fy] for camera in cameras]),
+            principal=np.array([[camera.cx, camera.cy] for camera in cameras]),
+            sizes=np.array([[camera.width, camera.height] for camera in cameras], dtype=np.float64),
             points=scene.similarity.to_input(scene.points),
             photos=np.arange(len(cameras)),
             count=len(cameras),
@@ -103,12 +103,12 @@ class Rig:
         rigs = (self, *others)
         return replace(
             self,
-            rotations=np.concatenate([each.rotations for each in rigs]),
-            translations=np.concatenate([each.translations for each in rigs]),
-            focal=np.concatenate([each.focal for each in rigs]),
-            principal=np.concatenate([each.principal for each in rigs]),
-            sizes=np.concatenate([each.sizes for each in rigs]),
-            photos=np.concatenate([each.photos for each in rigs]),
+            rotations=np.concatenate([rig.rotations for rig in rigs]),
+            translations=np.concatenate([rig.translations for rig in rigs]),
+            focal=np.concatenate([rig.focal for rig in rigs]),
+            principal=np.concatenate([rig.principal for rig in rigs]),
+            sizes=np.concatenate([rig.sizes for rig in rigs]),
+            photos=np.concatenate([rig.photos for rig in rigs]),
         )
 
     @property
@@ -131,7 +131,7 @@ class Rig:
         front = depth > 0.0
         inverse = np.divide(1.0, depth, out=np.zeros_like(depth), where=front)
         focal, principal = (
-            (each / self.sizes).T[:, :, None] for each in (self.focal, self.principal)
+            (intrinsic / self.sizes).T[:, :, None] for intrinsic in (self.focal, self.principal)
         )
         across, down = shares = focal * np.stack([x * inverse, y * inverse]) + principal
         inside = front & (across >= 0.0) & (across < 1.0) & (down >= 0.0) & (down < 1.0)
@@ -207,11 +207,11 @@ class Evidence:
     def agreement(self, rig: Rig) -> Agreement:
         """Measure the agreement of photos and points in a rig, which a trial may have changed."""
         shares, depth, inside = rig.project(self.rows)
-        known = self.rows >= 0
-        inside &= known
+        is_listed = self.rows >= 0
+        inside &= is_listed
         if not self.tracked:
             inside &= _unhidden(shares, depth, inside)
-        counts, framed = known.sum(axis=1), inside.sum(axis=1)
+        counts, framed = is_listed.sum(axis=1), inside.sum(axis=1)
         share = np.divide(framed, counts, out=np.full(len(counts), np.nan), where=counts > 0)
         shown = self._shown(rig.photos, shares, inside)
         if self.colors is not None:
@@ -219,13 +219,13 @@ class Evidence:
             return _compared(share, inside, shown, expected)
         rows = self.rows[inside]
         times = np.bincount(rows)[rows]
-        sums = np.stack([np.bincount(rows, each)[rows] for each in shown[inside].T], axis=-1)
+        sums = np.stack([np.bincount(rows, channel)[rows] for channel in shown[inside].T], axis=-1)
         expected = np.zeros_like(shown)
         expected[inside] = (sums - shown[inside]) / np.maximum(times - 1, 1)[:, None]
         inside[inside] = times > 1
-        found = _compared(share, inside, shown, expected)
-        few = found.inside < FEWEST_OF_PHOTOS
-        return replace(found, correlation=np.where(few, np.nan, found.correlation))
+        agreement = _compared(share, inside, shown, expected)
+        few = agreement.inside < FEWEST_OF_PHOTOS
+        return replace(agreement, correlation=np.where(few, np.nan, agreement.correlation))
 
     def _shown(self, photos: Integers, shares: Floats, inside: Booleans) -> Floats:
         """Return the photos' colours [V, N, 3] at points; clears `inside` for masked pixels."""
@@ -269,12 +269,12 @@ def observed(scene: Scene, views: Integers, pixels: Pixels) -> Evidence:
     """
     rank = np.random.default_rng(0).permutation(len(scene.points))
     rows = np.full((len(views), MOST_OBSERVED), -1)
-    for place, view in enumerate(views):
+    for row, view in enumerate(views):
         seen = scene.views[view].seen
         if len(seen) > MOST_OBSERVED:
             first = len(rank) * MOST_OBSERVED / len(seen)
             seen = seen.take(np.flatnonzero(rank.take(seen) < first)[:MOST_OBSERVED])
-        rows[place, : len(seen)] = seen
+        rows[row, : len(seen)] = seen
     return Evidence(pixels, Rig.of(scene).chosen(views), rows, scene.point_colors, tracked=True)
 
 
@@ -288,8 +288,8 @@ def tested(scene: Scene, views: Integers, pixels: Pixels, most: int) -> Evidence
         most: Number of points of all views together.
     """
     number, total = max(most // len(views), _TESTED), len(scene.points)
-    some = np.random.default_rng(0).choice(total, min(number, total), replace=False)
-    rows = np.broadcast_to(some, (len(views), len(some)))
+    sample = np.random.default_rng(0).choice(total, min(number, total), replace=False)
+    rows = np.broadcast_to(sample, (len(views), len(sample)))
     return Evidence(pixels, Rig.of(scene).chosen(views), rows, scene.point_colors, tracked=False)
 
 
@@ -322,9 +322,11 @@ def _compared(share: Floats, inside: Booleans, shown: Floats, expected: Floats) 
 
     off, off_expected = centered(shown), centered(expected)
     squares = products(off, off), products(off_expected, off_expected)
-    spread = [np.sqrt(each / (3.0 * divisor)) for each in squares]
-    told = (number >= FEWEST) & (np.minimum(*spread) >= FLAT)
+    spread = [np.sqrt(square_sums / (3.0 * divisor)) for square_sums in squares]
+    comparable = (number >= FEWEST) & (np.minimum(*spread) >= FLAT)
     correlation = np.full(len(number), np.nan)
     product = products(off, off_expected)
-    correlation[told] = product[told] / np.sqrt(squares[0][told] * squares[1][told])
+    correlation[comparable] = product[comparable] / np.sqrt(
+        squares[0][comparable] * squares[1][comparable]
+    )
     return Agreement(share, number, correlation, spread[1])

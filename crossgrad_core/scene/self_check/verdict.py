@@ -171,8 +171,8 @@ class _Group:
     @cached_property
     def better(self) -> float:
         """The correlation of the better photos; 0 if no photo has a correlation."""
-        known = self.agreement.correlation[np.isfinite(self.agreement.correlation)]
-        return float(np.quantile(known, _BETTER)) if len(known) else 0.0
+        correlations = self.agreement.correlation[np.isfinite(self.agreement.correlation)]
+        return float(np.quantile(correlations, _BETTER)) if len(correlations) else 0.0
 
     @property
     def told(self) -> Booleans:
@@ -194,9 +194,11 @@ class _Group:
         correlation, noise = self.agreement.correlation, self.agreement.noise
         low = np.nan_to_num(correlation, nan=1.0) < _BAD * self.better
         good = np.isfinite(correlation) & ~low
-        usual = float(np.median(noise[good])) if good.any() else 0.0
+        typical_noise = float(np.median(noise[good])) if good.any() else 0.0
         # The limit is halfway between the noise of consistent photos and of unrelated photos.
-        unlike = low & (np.nan_to_num(noise) > usual * (1.0 - min(self.better, 0.99) ** 2) ** -0.25)
+        unlike = low & (
+            np.nan_to_num(noise) > typical_noise * (1.0 - min(self.better, 0.99) ** 2) ** -0.25
+        )
         if self.recolored:  # Colours from a few other photos are not reliable enough.
             unlike[:] = False
         if not self.evidence.tracked:
@@ -208,10 +210,10 @@ class _Group:
     def verdict(self) -> Verdict:
         """Return the result for these photos."""
         correlation = self.agreement.correlation
-        known = np.isfinite(correlation)
+        has_correlation = np.isfinite(correlation)
         verdict = Verdict(
             int(self.told.sum()),
-            float(np.median(correlation[known])) if known.any() else np.nan,
+            float(np.median(correlation[has_correlation])) if has_correlation.any() else np.nan,
             float(np.nanmedian(self.agreement.share)) if self.evidence.tracked else np.nan,
             notes=(
                 (
@@ -229,22 +231,22 @@ class _Group:
         bad = self.bad
         if self.better < LEAST or bad[self.told].mean() > _MOST_BAD or self._mean < LEAST:
             return self._as_a_whole(verdict)
-        found = self._of_all(np.flatnonzero(self.told & ~bad))
-        if found is not None:
-            return replace(verdict, all_wrong=found)
+        cause = self._of_all(np.flatnonzero(self.told & ~bad))
+        if cause is not None:
+            return replace(verdict, all_wrong=cause)
         return replace(verdict, some_wrong=self.suspects())
 
     def _of_all(self, rows: Integers) -> Cause | None:
         """Find a change of all cameras that improves photos which agree only partly."""
         bench = Bench(self.evidence, rows)
         if bench.before < _SURE:
-            found = bench.best(likely())
-            if found.repairs and found.trial is not None:
-                return self._cause(found.trial)
+            diagnosis = bench.best(likely())
+            if diagnosis.repairs and diagnosis.trial is not None:
+                return self._cause(diagnosis.trial)
         if not self.recolored and bench.is_off():
-            found = bench.diagnosis()
-            if found.trial is not None and found.after >= found.before + _GAIN_OF_ALL:
-                return self._cause(found.trial)
+            diagnosis = bench.diagnosis()
+            if diagnosis.trial is not None and diagnosis.after >= diagnosis.before + _GAIN_OF_ALL:
+                return self._cause(diagnosis.trial)
         return None
 
     @property
@@ -259,9 +261,9 @@ class _Group:
         """Return the result if most photos disagree."""
         cameras = np.arange(len(self.views))
         bench = Bench(self.evidence, cameras)
-        found = bench.best(likely()) if self.recolored else bench.diagnosis()
-        if found.repairs and found.trial is not None:
-            return replace(verdict, all_wrong=self._cause(found.trial))
+        diagnosis = bench.best(likely()) if self.recolored else bench.diagnosis()
+        if diagnosis.repairs and diagnosis.trial is not None:
+            return replace(verdict, all_wrong=self._cause(diagnosis.trial))
         chosen = some(cameras)
         others = some(cameras, _MOST_COMPARED)
         if not self.recolored and 2 * len(self._fitting_others(chosen, others)) >= len(chosen):
@@ -319,22 +321,24 @@ class _Group:
             return None, none
         bench = Bench(self.evidence, rows)
         if len(rows) > _FEW:
-            found = bench.diagnosis()
-            repaired = self._repaired(found, rows)
-            if found.trial is not None and 2 * len(repaired) > len(rows):
-                return Cause(self._named(repaired), found.trial.cause, found.trial.todo), repaired
-        found = bench.best(turns())
-        repaired = self._repaired(found, rows)
-        if found.trial is None or not len(repaired):
+            diagnosis = bench.diagnosis()
+            repaired = self._repaired(diagnosis, rows)
+            if diagnosis.trial is not None and 2 * len(repaired) > len(rows):
+                return Cause(
+                    self._named(repaired), diagnosis.trial.cause, diagnosis.trial.todo
+                ), repaired
+        diagnosis = bench.best(turns())
+        repaired = self._repaired(diagnosis, rows)
+        if diagnosis.trial is None or not len(repaired):
             return None, none
-        return Cause(self._named(repaired), found.trial.cause, found.trial.todo), repaired
+        return Cause(self._named(repaired), diagnosis.trial.cause, diagnosis.trial.todo), repaired
 
-    def _repaired(self, found: Diagnosis, rows: Integers) -> Integers:
+    def _repaired(self, diagnosis: Diagnosis, rows: Integers) -> Integers:
         """Return the photos that a change repairs."""
-        if found.trial is None:
+        if diagnosis.trial is None:
             return rows[:0]
         evidence = self.evidence.chosen(rows)
-        changed = evidence.agreement(found.trial.change(evidence.rig))
+        changed = evidence.agreement(diagnosis.trial.change(evidence.rig))
         return rows[self._fits(scores(changed, tracked=evidence.tracked), rows)]
 
     def _fits(self, after: Floats, rows: Integers) -> Booleans:

@@ -45,13 +45,13 @@ def sample_gradients(views: int, seed: int = 0) -> list[Gradients]:
     def gradient(shape: tuple[int, ...]) -> Tensor:
         return torch.from_numpy(rng.normal(size=shape).astype(np.float32))
 
-    found: list[Gradients] = [
+    gradients: list[Gradients] = [
         {name: gradient(shape) for name, shape in _SHAPES.items()} for _ in range(views)
     ]
     # The last view does not see the network, except if it is the only view.
     if views > 1:
-        found[-1] |= {"net.weight": None, "net.bias": None}
-    return found
+        gradients[-1] |= {"net.weight": None, "net.bias": None}
+    return gradients
 
 
 def aggregate_context(
@@ -80,7 +80,12 @@ def _summed(gradients: Sequence[Mapping[str, Tensor | None]]) -> SummedGradients
     total = SummedGradients.empty(BLOCKS, len(gradients))
     for view in gradients:
         # The sum takes ownership of the tensors and modifies them.
-        total.add({name: None if each is None else each.clone() for name, each in view.items()})
+        total.add(
+            {
+                name: None if gradient is None else gradient.clone()
+                for name, gradient in view.items()
+            }
+        )
     return total
 
 

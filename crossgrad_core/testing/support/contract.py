@@ -57,11 +57,11 @@ def admitted(views: ViewCounts) -> tuple[int, ...]:
     Raises:
         ContractError: No number from `VIEW_COUNTS` is admitted.
     """
-    found = tuple(count for count in VIEW_COUNTS if views.admits(count))
+    counts = tuple(count for count in VIEW_COUNTS if views.admits(count))
     require(
-        found, f"the component supports no number of views from 1 to {max(VIEW_COUNTS)}: {views}"
+        counts, f"the component supports no number of views from 1 to {max(VIEW_COUNTS)}: {views}"
     )
-    return found
+    return counts
 
 
 def revived(state: PluginState) -> PluginState:

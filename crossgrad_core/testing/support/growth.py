@@ -27,14 +27,14 @@ _WINDOW = 1000
 def size_of(state: PluginState) -> int:
     """Count the numbers, letters and names in a state; per-primitive tensors count one row."""
     rows = sum(tensor[:1].numel() for tensor in state.per_primitive.values())
-    return _size(state.values) + sum(each.numel() for each in state.tensors.values()) + rows
+    return _size(state.values) + sum(tensor.numel() for tensor in state.tensors.values()) + rows
 
 
 def _size(value: object) -> int:
     if isinstance(value, str):
         return len(value)
     if isinstance(value, Mapping):
-        return sum(_size(name) + _size(each) for name, each in value.items())
+        return sum(_size(name) + _size(item) for name, item in value.items())
     if isinstance(value, list | tuple):
         return sum(map(_size, value))
     return 1
@@ -96,9 +96,9 @@ def _tensors() -> int:
     """Return the bytes of all live tensors; tracemalloc does not see torch's allocations."""
     gc.collect()
     storages = {}
-    for each in gc.get_objects():
+    for candidate in gc.get_objects():
         # `isinstance` is avoided, because some objects answer it with warnings.
-        if issubclass(type(each), Tensor) and not each.is_sparse:
-            storage = each.untyped_storage()
+        if issubclass(type(candidate), Tensor) and not candidate.is_sparse:
+            storage = candidate.untyped_storage()
             storages[storage.data_ptr()] = storage.nbytes()
     return sum(storages.values())

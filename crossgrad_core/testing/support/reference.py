@@ -52,8 +52,8 @@ def device_of(rasterizer: Rasterizer) -> torch.device:
 
 def tensors_of(gaussians: Gaussians) -> dict[str, Tensor]:
     """Return the tensors that are not None, by name."""
-    found = {each.name: getattr(gaussians, each.name) for each in fields(gaussians)}
-    return {name: value for name, value in found.items() if isinstance(value, Tensor)}
+    values = {member.name: getattr(gaussians, member.name) for member in fields(gaussians)}
+    return {name: value for name, value in values.items() if isinstance(value, Tensor)}
 
 
 def moved(
@@ -92,50 +92,50 @@ def _usual() -> Iterator[_Case]:
 
 
 def _cameras() -> Iterator[_Case]:
-    some, camera = sample_gaussians(harmonics=True), sample_camera()
+    gaussians, camera = sample_gaussians(harmonics=True), sample_camera()
     for view in sample_scene().train_views[1::3]:
-        yield _Case(f"camera of view {view.name} (world_to_camera)", some, view.camera)
+        yield _Case(f"camera of view {view.name} (world_to_camera)", gaussians, view.camera)
     aside = replace(camera, cx=camera.cx + 5.0, cy=camera.cy - 3.0)
-    yield _Case("principal point (cx, cy) away from the middle", some, aside)
+    yield _Case("principal point (cx, cy) away from the middle", gaussians, aside)
     stretched = replace(camera, fx=1.4 * camera.fx, fy=0.8 * camera.fy)
-    yield _Case("two focal lengths (fx, fy)", some, stretched)
+    yield _Case("two focal lengths (fx, fy)", gaussians, stretched)
     larger = replace(camera, width=camera.width + 17, height=camera.height + 3)
-    yield _Case("image of another size (width, height)", some, larger)
+    yield _Case("image of another size (width, height)", gaussians, larger)
 
 
 def _extremes() -> Iterator[_Case]:
-    some = sample_gaussians()
-    ramp = torch.linspace(0.0, 1.0, len(some))
+    gaussians = sample_gaussians()
+    ramp = torch.linspace(0.0, 1.0, len(gaussians))
     with torch.no_grad():
         changed: dict[str, Mapping[str, Tensor]] = {
             "opacities from 0 to 1": {"opacities": ramp},
             "opaque layers, one behind the other": {"opacities": 0.95 + 0.05 * ramp},
-            "needles": {"scales": some.scales * torch.tensor([4.0, 0.02, 0.02])},
-            "Gaussians larger than the image": {"scales": 10.0 * some.scales},
-            "Gaussians far smaller than a pixel": {"scales": 1e-3 * some.scales},
+            "needles": {"scales": gaussians.scales * torch.tensor([4.0, 0.02, 0.02])},
+            "Gaussians larger than the image": {"scales": 10.0 * gaussians.scales},
+            "Gaussians far smaller than a pixel": {"scales": 1e-3 * gaussians.scales},
             "quaternions of other lengths": {
-                "quats": some.quats * 10.0 ** (4.0 * ramp - 2.0)[:, None]
+                "quats": gaussians.quats * 10.0 ** (4.0 * ramp - 2.0)[:, None]
             },
-            "Gaussians beside and behind the camera": {"means": 8.0 * some.means},
+            "Gaussians beside and behind the camera": {"means": 8.0 * gaussians.means},
             "colours below 0 and above 1": {"colors": 4.0 * ramp[:, None].expand(-1, 3) - 2.0},
         }
     for name, tensors in changed.items():
         fields: dict[str, Any] = dict(tensors)
-        yield _Case(name, replace(some, **fields))
+        yield _Case(name, replace(gaussians, **fields))
 
 
 def _options() -> Iterator[_Case]:
-    some, camera = sample_gaussians(), sample_camera()
-    opaque = replace(some, opacities=torch.full_like(some.opacities, 0.95))
+    gaussians, camera = sample_gaussians(), sample_camera()
+    opaque = replace(gaussians, opacities=torch.full_like(gaussians.opacities, 0.95))
     yield _Case("option max_alpha = 0.5", opaque, options={"max_alpha": 0.5})
-    yield _Case("option dilation = 2", some, options={"dilation": 2.0})
-    depths = _depths(some, camera).sort().values
+    yield _Case("option dilation = 2", gaussians, options={"dilation": 2.0})
+    depths = _depths(gaussians, camera).sort().values
     # Put the value into the widest gap, so that rounding moves no centre to the other side.
     inner = slice(len(depths) // 4, 3 * len(depths) // 4)
     gaps = depths.diff()[inner]
     widest = int(gaps.argmax()) + len(depths) // 4
     near = float(depths[widest : widest + 2].mean())
-    yield _Case(f"option near = {near:.3g}", some, options={"near": near})
+    yield _Case(f"option near = {near:.3g}", gaussians, options={"near": near})
 
 
 def _depths(gaussians: Gaussians, camera: Camera) -> Tensor:
@@ -197,11 +197,11 @@ def _require_same(rasterizer: Rasterizer, case: _Case) -> None:
     outputs = rasterizer.provides & {"depth", "abs_gradient"}
     exact = _drawn(reference, case, outputs, torch.float64)
     rounded = _drawn(reference, case, outputs)
-    found = _drawn(rasterizer, case, outputs)
+    tested = _drawn(rasterizer, case, outputs)
     for name, expected in exact.pixels.items():
-        _require_pixels(case.name, name, found.pixels, expected, rounded.pixels[name])
+        _require_pixels(case.name, name, tested.pixels, expected, rounded.pixels[name])
     for name, expected in exact.gradients.items():
-        _require_gradient(case.name, name, found.gradients, expected, rounded.gradients[name])
+        _require_gradient(case.name, name, tested.gradients, expected, rounded.gradients[name])
 
 
 def _require_pixels(
@@ -276,10 +276,10 @@ def views_drawn_together_are_the_same(make: Make[Rasterizer]) -> None:
     """`render_views` gives the same images as `render` for each view, with its own background."""
     rasterizer = make()
     device = device_of(rasterizer)
-    some = [moved(sample_gaussians(number), device) for number in (30, 30, 12)]
+    gaussians = [moved(sample_gaussians(number), device) for number in (30, 30, 12)]
     cameras = [view.camera for view in sample_scene().train_views[:3]]
     backgrounds = [torch.full((3,), level, device=device) for level in (0.0, 0.5, 1.0)]
-    views = list(zip(some, cameras, strict=True))
+    views = list(zip(gaussians, cameras, strict=True))
     with torch.no_grad():
         together = rasterizer.render_views(views, backgrounds)
         alone = [

@@ -59,9 +59,9 @@ def reasons_to_refuse(config: RunConfig) -> tuple[str, ...]:
     # time.
     observers = [build(Observer, choice.name, choice.options) for choice in config.observers]
     plugins = (*selection.plugins.values(), *observers)
-    asked = (getattr(each, "crossgrad_validate_selection", None) for each in plugins)
+    asked = (getattr(plugin, "crossgrad_validate_selection", None) for plugin in plugins)
     answers = [ask(selection) for ask in asked if ask is not None]
-    return reasons_against(config, selection, [each for each in answers if each])
+    return reasons_against(config, selection, [answer for answer in answers if answer])
 
 
 def setup_of(config: RunConfig) -> Setup:
@@ -103,12 +103,12 @@ def require_repeated(run: ShortRun, again: ShortRun) -> None:
     """Require that two runs with one seed are equal to the bit."""
     for step, (one, other) in enumerate(zip(run.records, again.records, strict=True), 1):
         for what in ("views", "losses", "counts"):
-            found = getattr(one, what), getattr(other, what)
-            same = found[0] == found[1]
+            pair = getattr(one, what), getattr(other, what)
+            same = pair[0] == pair[1]
             require(
                 same,
                 f"step {step}: two runs with the same seed have the {what} "
-                f"{listed(map(str, found))}",
+                f"{listed(map(str, pair))}",
             )
     require(
         run.after.keys() == again.after.keys(), "two runs with the same seed have other tensors"

@@ -193,7 +193,7 @@ def _check(
     for name, param in params.items():
         grad = grads.get(name)
         if grad is not None and (grad.shape != param.shape or grad.dtype != param.dtype):
-            found = f"{list(grad.shape)} {grad.dtype} for {list(param.shape)} {param.dtype}"
+            mismatch = f"{list(grad.shape)} {grad.dtype} for {list(param.shape)} {param.dtype}"
             raise ValueError(
-                f"the gradient of `{name}` must have the shape and type of the tensor; {found}"
+                f"the gradient of `{name}` must have the shape and type of the tensor; {mismatch}"
             )

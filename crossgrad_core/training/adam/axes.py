@@ -41,10 +41,10 @@ def step_along_axes(positions: Tensor, steps: Tensor, scales: Tensor, quats: Ten
     bound = log(LIMIT)
     factors = (scales - _usual(scales)).clamp_(-bound, bound).exp_()
     arrays = [positions, steps, factors, quats]
-    if is_native(arrays) and all(each.is_contiguous() for each in arrays):
+    if is_native(arrays) and all(array.is_contiguous() for array in arrays):
         from crossgrad_core.training.adam.numba_kernels.axes import move_rows
 
-        move_rows(*(each.detach().numpy() for each in arrays))
+        move_rows(*(array.detach().numpy() for array in arrays))
         # NumPy wrote without autograd, so invalidate graphs that use the old values.
         torch.autograd.graph.increment_version(positions)
     else:
@@ -63,14 +63,14 @@ def _usual(scales: Tensor) -> Tensor | float:
 
     Non-finite values are left out, so that they do not affect other Gaussians.
     """
-    some = scales[:: -(-len(scales) // _SAMPLE)]
-    if is_native([some]):  # NumPy has less overhead than torch.
-        rows = some.numpy()
+    sample = scales[:: -(-len(scales) // _SAMPLE)]
+    if is_native([sample]):  # NumPy has less overhead than torch.
+        rows = sample.numpy()
         # NaN comes last, as in torch's sort.
         a, b, c = np.where(np.isnan(rows), np.float32(inf), rows).T
         lengths = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
         lengths = lengths[np.isfinite(lengths)]
-        place = (len(lengths) - 1) // 2
-        return float(np.partition(lengths, place)[place]) if len(lengths) else nan
-    middle = some.sort(dim=1).values[:, 1]
+        middle_row = (len(lengths) - 1) // 2
+        return float(np.partition(lengths, middle_row)[middle_row]) if len(lengths) else nan
+    middle = sample.sort(dim=1).values[:, 1]
     return torch.where(middle.isfinite(), middle, torch.nan).nanmedian()

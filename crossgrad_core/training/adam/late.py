@@ -91,11 +91,11 @@ class Late:
         Args:
             name: The tensor; None means all tensors.
         """
-        for each in [name] if name is not None else list(self._under_way):
-            if (begun := self._under_way.get(each)) is not None:
+        for tensor_name in [name] if name is not None else list(self._under_way):
+            if (begun := self._under_way.get(tensor_name)) is not None:
                 # Keep the failed step, so that it raises its error again.
                 begun.end()
-                del self._under_way[each]
+                del self._under_way[tensor_name]
 
     def forget(self) -> None:
         """Discard all steps; no thread changes a tensor after the return."""

@@ -36,25 +36,25 @@ def reduce_by_area(
         total[:] = 0.0
         cover[:] = 0.0 if masked else bottom - top
         for y in range(int(top), ceil(bottom)):
-            part = min(bottom, y + 1.0) - max(top, float(y))
+            share = min(bottom, y + 1.0) - max(top, float(y))
             if masked:
                 for x in range(width):
-                    area = part * kept[y, x]
+                    area = share * kept[y, x]
                     cover[x] += area
                     for channel in range(3 * x, 3 * x + 3):
                         total[channel] += area * image[y, channel]
             else:
                 for channel in range(3 * width):
-                    total[channel] += part * image[y, channel]
+                    total[channel] += share * image[y, channel]
         for column in range(columns):
             left, right = column * wide, min((column + 1) * wide, float(width))
             red, green, blue, area = 0.0, 0.0, 0.0, 0.0
             for x in range(int(left), ceil(right)):
-                part = min(right, x + 1.0) - max(left, float(x))
-                area += part * cover[x]
-                red += part * total[3 * x]
-                green += part * total[3 * x + 1]
-                blue += part * total[3 * x + 2]
+                share = min(right, x + 1.0) - max(left, float(x))
+                area += share * cover[x]
+                red += share * total[3 * x]
+                green += share * total[3 * x + 1]
+                blue += share * total[3 * x + 2]
             mean = 1.0 / area if area > 0.0 else 0.0
             small[row, column, 0] = np.uint8(np.rint(red * mean))
             small[row, column, 1] = np.uint8(np.rint(green * mean))

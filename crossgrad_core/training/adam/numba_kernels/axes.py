@@ -61,7 +61,7 @@ def _move_chunks(
     jobs: Jobs, positions: _Floats, steps: _Floats, factors: _Floats, quats: _Floats
 ) -> None:
     # Buffers for the last rows of a job.
-    place, step = np.zeros((LANES, 3), np.float32), np.zeros((LANES, 3), np.float32)
+    position, step = np.zeros((LANES, 3), np.float32), np.zeros((LANES, 3), np.float32)
     factor, quat = np.zeros((LANES, 3), np.float32), np.zeros((LANES, 4), np.float32)
     rows = len(positions)
     chunks = (rows + _ROWS - 1) // _ROWS
@@ -77,12 +77,12 @@ def _move_chunks(
             store_triples(positions, 3 * i, x + moved[0], y + moved[1], z + moved[2])
         left = end - whole
         if left:
-            place[:left], step[:left] = positions[whole:end], steps[whole:end]
+            position[:left], step[:left] = positions[whole:end], steps[whole:end]
             factor[:left], quat[:left] = factors[whole:end], quats[whole:end]
             moved = _stretched(load_triples(step, 0), load_triples(factor, 0), load_fours(quat, 0))
-            x, y, z = load_triples(place, 0)
-            store_triples(place, 0, x + moved[0], y + moved[1], z + moved[2])
-            positions[whole:end] = place[:left]
+            x, y, z = load_triples(position, 0)
+            store_triples(position, 0, x + moved[0], y + moved[1], z + moved[2])
+            positions[whole:end] = position[:left]
         job = next_job(jobs, chunks)
 
 

@@ -150,11 +150,11 @@ def catch_up(
     tasks = (count + _ROWS - 1) // _ROWS
     task = next_job(jobs, tasks)
     while task < tasks:
-        for place in range(task * _ROWS, min(count, (task + 1) * _ROWS)):
-            ahead = place + _AHEAD
+        for index in range(task * _ROWS, min(count, (task + 1) * _ROWS)):
+            ahead = index + _AHEAD
             if not whole and ahead < count and done[rows[ahead]] - before < end:
                 _bring_near(rows, ahead, width, param, exp_avg, exp_avg_sq)
-            i = np.intp(place) if whole else np.intp(rows[place])
+            i = np.intp(index) if whole else np.intp(rows[index])
             first = np.intp(done[i]) - before
             if first >= end:
                 continue
@@ -210,7 +210,7 @@ def _step_row(
     row: int,
     width: int,
     drawn: bool,
-    place: int,
+    grad_row: int,
     param: Floats,
     grad: Floats,
     exp_avg: Floats,
@@ -219,9 +219,9 @@ def _step_row(
 ) -> None:
     """Apply one step to a row of WIDE elements or more.
 
-    The gradient of the row is row `place` of `grad` if the row was rendered, else zero.
+    The gradient of the row is row `grad_row` of `grad` if the row was rendered, else zero.
     """
-    at, begin, g = row * width, place * width, splat_wide(_ZERO)
+    at, begin, g = row * width, grad_row * width, splat_wide(_ZERO)
     # The last sixteen elements overlap with earlier ones, so compute them before these are written.
     tail = at + width - WIDE
     if drawn:
@@ -329,21 +329,21 @@ def update_all(
     task = next_job(jobs, tasks)
     while task < tasks:
         end = min(count, (task + 1) * _ROWS)
-        place = np.searchsorted(rows, task * _ROWS)
+        next_row = np.searchsorted(rows, task * _ROWS)
         for first in range(task * _ROWS, end, together):
             stop = min(first + together, end)
-            a, b, begin = first * width, stop * width, place
-            while place < rows.size and rows[place] < stop:
-                place += 1
-            drawn = place - begin
+            a, b, begin = first * width, stop * width, next_row
+            while next_row < rows.size and rows[next_row] < stop:
+                next_row += 1
+            drawn = next_row - begin
             if drawn == stop - first:
-                given = grad[begin * width : place * width]
+                given = grad[begin * width : next_row * width]
                 update(param[a:b], given, exp_avg[a:b], exp_avg_sq[a:b], numbers)
                 continue
             if not drawn and not moves(pulls[: b - a], exp_avg[a:b], exp_avg_sq[a:b]):
                 continue
             if width < WIDE:
-                for k in range(begin, place):
+                for k in range(begin, next_row):
                     at, to = k * width, (np.intp(rows[k]) - first) * width
                     for i in range(width):
                         pulls[to + i] = grad[at + i]
@@ -351,7 +351,9 @@ def update_all(
                 pulls[: b - a] = _ZERO
                 continue
             for row in range(first, stop):
-                own = begin < place and rows[begin] == row
-                _step_row(row, width, own, begin, param, grad, exp_avg, exp_avg_sq, numbers)
-                begin += own
+                has_gradient = begin < next_row and rows[begin] == row
+                _step_row(
+                    row, width, has_gradient, begin, param, grad, exp_avg, exp_avg_sq, numbers
+                )
+                begin += has_gradient
         task = next_job(jobs, tasks)
