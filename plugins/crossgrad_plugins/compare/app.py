@@ -65,7 +65,7 @@ def differing_code(arms: Mapping[str, Runs]) -> list[str]:
         if code:
             groups.setdefault(code, []).append(arm)
     if len(groups) > 1:
-        shown = [f"{_named(own)} ran at {code}" for code, own in groups.items()]
+        shown = [f"{_named(group)} ran at {code}" for code, group in groups.items()]
         more = len(shown) - _MOST_SHOWN
         parts = [*shown[:_MOST_SHOWN], *([f"{more} more"] if more > 0 else [])]
         return [f"code differs: {'; '.join(parts)}: {_MEANING}"]
@@ -97,11 +97,11 @@ def _named(arms: list[str]) -> str:
 
 def _unlike_pairs(arms: Mapping[str, Runs]) -> Iterator[tuple[Run, Run]]:
     """Yield two runs on one scene with one seed that come from different code."""
-    known: dict[tuple[str, int], Run] = {}
+    first_runs: dict[tuple[str, int], Run] = {}
     for runs in arms.values():
         for problem, run in runs.items():
             if code := code_of(run):
-                first = known.setdefault(problem, run)
+                first = first_runs.setdefault(problem, run)
                 if code_of(first) != code:
                     yield first, run
 
@@ -163,15 +163,15 @@ def page_of(
         runs=tables.runs_table(comparison),
         pictured=pictured,
         worst=[
-            tables.views_table(comparison, scene, own[:_WORST_NAMED])
-            for scene, own in views.items()
-            if own
+            tables.views_table(comparison, scene, scene_views[:_WORST_NAMED])
+            for scene, scene_views in views.items()
+            if scene_views
         ],
         notes=notes,
         machines=machines(comparison),
         light=variables(),
         dark={f"series-{number}": color for number, color in enumerate(_DARK)},
-        colors={arm: variable[each.color] for arm, each in look.items()},
+        colors={arm: variable[style.color] for arm, style in look.items()},
         limits={"bootstrap": BOOTSTRAP_FROM, "holm": UNCORRECTED, "open": _OPEN_ROWS},
     )
 
@@ -324,4 +324,4 @@ def _default_folder(places: Sequence[Path]) -> Path:
     only = places[0]
     if len(places) == 1 and not (only / "config.yaml").is_file():
         return only / FOLDER
-    return Path(os.path.commonpath([place.absolute().parent for place in places])) / FOLDER
+    return Path(os.path.commonpath([path.absolute().parent for path in places])) / FOLDER

@@ -71,9 +71,9 @@ def arms_of(runs: Sequence[Run], failed: Sequence[Run] = ()) -> tuple[Arm, ...]:
 def _grouped(runs: Sequence[Run]) -> list[tuple[str, list[Run]]]:
     """Return the name and the runs of each arm; all names differ."""
     if all(run.label for run in runs):
-        found = _by_labels(runs)
-        if len({name for name, _ in found}) == len(found):
-            return found
+        arms = _by_labels(runs)
+        if len({name for name, _ in arms}) == len(arms):
+            return arms
     # A run with two labels is listed twice.
     return _by_settings(list({run.name: run for run in runs}.values()))
 
@@ -82,16 +82,16 @@ def _by_labels(runs: Sequence[Run]) -> list[tuple[str, list[Run]]]:
     labelled: dict[str, list[Run]] = {}
     for run in runs:
         labelled.setdefault(str(run.label), []).append(run)
-    found = []
-    for label, own in labelled.items():
-        parts = _by_settings(own)
+    arms = []
+    for label, group in labelled.items():
+        parts = _by_settings(group)
         if len(parts) == 1:
-            found.append((label, own))
+            arms.append((label, group))
         elif len(labelled) == 1:
-            found += parts
+            arms += parts
         else:
-            found += [(f"{label}, {name}", members) for name, members in parts]
-    return found
+            arms += [(f"{label}, {name}", members) for name, members in parts]
+    return arms
 
 
 def _by_settings(runs: Sequence[Run]) -> list[tuple[str, list[Run]]]:
@@ -171,8 +171,8 @@ def _names(
 
 def _name(keys: Sequence[str], values: tuple[str, ...], chosen: Sequence[int]) -> str:
     """Return the chosen settings as a name; options of absent components are left out."""
-    known = [index for index in chosen if values[index] != ABSENT]
-    return ", ".join(_part(keys[index], values[index]) for index in known or chosen)
+    present = [index for index in chosen if values[index] != ABSENT]
+    return ", ".join(_part(keys[index], values[index]) for index in present or chosen)
 
 
 def _distinguished(groups: Iterable[tuple[str, ...]], chosen: Sequence[int]) -> int:
@@ -214,9 +214,9 @@ class Cells:
         runs: dict[str, dict[Problem, dict[Length, Run]]] = {}
         repetitions: dict[str, str] = {}
         for arm in arms:
-            own = runs.setdefault(arm.name, {})
+            by_problem = runs.setdefault(arm.name, {})
             for run in arm.runs:
-                kept = own.setdefault((run.scene, run.seed), {}).setdefault(run.length, run)
+                kept = by_problem.setdefault((run.scene, run.seed), {}).setdefault(run.length, run)
                 if kept is not run:
                     repetitions[run.name] = kept.name
         return cls(runs, repetitions)
@@ -272,16 +272,18 @@ class Cells:
 
     def _chosen(self) -> dict[tuple[str, str], Length]:
         """Return arm and scene -> the length used there; no entry without the usual length."""
-        usual: dict[str, Counter[Length]] = {}
-        own: dict[tuple[str, str], Counter[Length]] = {}
+        scene_counts: dict[str, Counter[Length]] = {}
+        arm_counts: dict[tuple[str, str], Counter[Length]] = {}
         for arm, problems in self.runs.items():
             for (scene, _), by in problems.items():
-                usual.setdefault(scene, Counter()).update(by.keys())
-                own.setdefault((arm, scene), Counter()).update(by.keys())
-        most = {scene: max(n, key=lambda x: (n[x], _amount(x))) for scene, n in usual.items()}
+                scene_counts.setdefault(scene, Counter()).update(by.keys())
+                arm_counts.setdefault((arm, scene), Counter()).update(by.keys())
+        most = {
+            scene: max(n, key=lambda x: (n[x], _amount(x))) for scene, n in scene_counts.items()
+        }
         return {
             (arm, scene): _preferred(counts, most[scene])
-            for (arm, scene), counts in own.items()
+            for (arm, scene), counts in arm_counts.items()
             if most[scene] in counts
         }
 
@@ -298,7 +300,7 @@ def _amount(length: Length) -> float:
     return length[1]
 
 
-def _preferred(counts: Mapping[Length, int], usual: Length) -> Length:
+def _preferred(counts: Mapping[Length, int], usual_length: Length) -> Length:
     """Return the usual length, or a length that occurs more than twice as often."""
-    own = max(counts, key=lambda length: (counts[length], _amount(length)))
-    return own if counts[own] > 2 * counts[usual] else usual
+    most_common = max(counts, key=lambda length: (counts[length], _amount(length)))
+    return most_common if counts[most_common] > 2 * counts[usual_length] else usual_length

@@ -44,9 +44,9 @@ def check_scenes(runs: Sequence[Run]) -> list[str]:
         UserError: The metrics of these runs are not comparable; the message states the reason.
     """
     for scene in dict.fromkeys(run.scene for run in runs):
-        own = [run for run in runs if run.scene == scene]
+        on_scene = [run for run in runs if run.scene == scene]
         for question in (_check_held_out, _check_photos, _check_sizes, _check_trained):
-            question(scene, own)
+            question(scene, on_scene)
     unknown = [run.name for run in runs if run.results.scene_marks is None]
     notes = []
     if unknown and len(runs) > 1:
@@ -71,9 +71,9 @@ def differing_regimes(runs: Sequence[Run]) -> tuple[str, ...]:
 
 
 def _check_held_out(scene: str, runs: Sequence[Run]) -> None:
-    found = _odd_one(runs, _held_out)
-    if found is not None:
-        first, second = found
+    pair = _odd_one(runs, _held_out)
+    if pair is not None:
+        first, second = pair
         raise UserError(
             f"runs of scene {scene} were evaluated on different held-out views",
             where=f"{first.name}, {second.name}",
@@ -84,11 +84,11 @@ def _check_held_out(scene: str, runs: Sequence[Run]) -> None:
 
 
 def _check_photos(scene: str, runs: Sequence[Run]) -> None:
-    found = _odd_one([run for run in runs if run.results.scene_marks], _photos)
-    if found is not None:
+    pair = _odd_one([run for run in runs if run.results.scene_marks], _photos)
+    if pair is not None:
         raise UserError(
             f"runs of scene {scene} were evaluated against different photos",
-            where=f"{found[0].name}, {found[1].name}",
+            where=f"{pair[0].name}, {pair[1].name}",
             expected="the same photo files in scene.json",
             found="photos of the same name with different bytes or masks",
             todo="compare only runs on the same state of the scene folder; compare another "
@@ -97,22 +97,22 @@ def _check_photos(scene: str, runs: Sequence[Run]) -> None:
 
 
 def _check_sizes(scene: str, runs: Sequence[Run]) -> None:
-    found = _odd_one([run for run in runs if _sizes(run)], _sizes)
-    if found is not None:
+    pair = _odd_one([run for run in runs if _sizes(run)], _sizes)
+    if pair is not None:
         raise UserError(
             f"runs of scene {scene} were evaluated at different photo sizes or with "
             "different resize filters",
-            where=f"{found[0].name}, {found[1].name}",
+            where=f"{pair[0].name}, {pair[1].name}",
             expected="the same size for all runs: PSNR falls with the size of the photos",
-            found=" against ".join(_sizes(run) for run in found),
+            found=" against ".join(_sizes(run) for run in pair),
             todo="compare only runs with the same --max-size and images folder",
         )
 
 
 def _check_trained(scene: str, runs: Sequence[Run]) -> None:
-    found = _odd_one([run for run in runs if run.results.scene_marks], _trained)
-    if found is not None:
-        first, second = found
+    pair = _odd_one([run for run in runs if run.results.scene_marks], _trained)
+    if pair is not None:
+        first, second = pair
         raise UserError(
             f"runs of scene {scene} were trained on different photos",
             where=f"{first.name}, {second.name}",
@@ -153,8 +153,8 @@ def _mark(file: object) -> object:
 def _sizes(run: Run) -> str:
     """Return photo sizes and resize filter from a run's notes; empty without such a note."""
     for note in run.summary.get("notes") or ():
-        if found := _SIZES.match(str(note)):
-            return f"{found['sizes']}, {found['how']}"
+        if match := _SIZES.match(str(note)):
+            return f"{match['sizes']}, {match['how']}"
     return ""
 
 
@@ -212,16 +212,16 @@ def quantities_of(
         else:
             kept.append(key)
     falling = {str(key) for run in runs for key in run.summary.get("falling") or ()}
-    found = (
+    quantities = (
         Quantity.of(key, margin if key == name else None, falls=key in falling) for key in kept
     )
-    return tuple(found), notes
+    return tuple(quantities), notes
 
 
 def _check_definition(runs: Sequence[Run], key: str) -> None:
-    found = _definitions(runs, key)
-    if len(found) > 1:
-        (first, one), (second, other), *_ = ((text, run) for text, run in found.items())
+    definitions = _definitions(runs, key)
+    if len(definitions) > 1:
+        (first, one), (second, other), *_ = ((text, run) for text, run in definitions.items())
         raise UserError(
             f"the runs define {key} differently"
             if key != _RENDERS
@@ -236,12 +236,12 @@ def _check_definition(runs: Sequence[Run], key: str) -> None:
 
 def _definitions(runs: Sequence[Run], key: str) -> dict[str, str]:
     """Return definition -> the first run that states it; runs without a definition are ignored."""
-    found: dict[str, str] = {}
+    definitions: dict[str, str] = {}
     for run in runs:
         text = (run.summary.get("definitions") or {}).get(key)
         if text is not None:
-            found.setdefault(str(text), run.name)
-    return found
+            definitions.setdefault(str(text), run.name)
+    return definitions
 
 
 def _overall(run: Run) -> dict[str, Any]:
@@ -310,8 +310,8 @@ def _other_machine(runs: Sequence[Run], fields: dict[str, str]) -> str:
 
 def _other_speed(runs: Sequence[Run], name: str) -> str:
     """Return how the calibrated speed of the machine differs between runs; empty if it is equal."""
-    known = [(run.number("environment", "calibration", name), run) for run in runs]
-    rates = [(rate, run) for rate, run in known if rate is not None]
+    speeds = [(run.number("environment", "calibration", name), run) for run in runs]
+    rates = [(rate, run) for rate, run in speeds if rate is not None]
     if len(rates) < len(runs):
         return ""
     (low, slow), (high, fast) = min(rates, key=_first), max(rates, key=_first)

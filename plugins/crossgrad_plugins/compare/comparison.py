@@ -121,7 +121,7 @@ class Comparison:
     def equal(self) -> tuple[Contrast, ...]:
         """The contrasts of the main pairs of arms at equal cost, if costs differ at the ends."""
         contrasts = [self._at_cost(couple, cost) for couple in self._telling for cost in self.costs]
-        return pairwise.judged(each for each in contrasts if each.inside)
+        return pairwise.judged(contrast for contrast in contrasts if contrast.inside)
 
     @cached_property
     def amounts(self) -> Mapping[tuple[str, str], float]:
@@ -136,8 +136,8 @@ class Comparison:
     @cached_property
     def regimes(self) -> tuple[Contrast, ...]:
         """The contrasts of the main pairs, overall and by regime, on scenes with agreed regimes."""
-        known = (run.results.regimes for run in self.runs if run.scene not in self.unlike)
-        names = sorted({regime for regimes in known for regime in regimes})
+        regime_lists = (run.results.regimes for run in self.runs if run.scene not in self.unlike)
+        names = sorted({regime for regimes in regime_lists for regime in regimes})
         if len(names) < 2:  # noqa: PLR2004 - a single one would repeat `overall`
             return ()
         return pairwise.judged(

@@ -104,18 +104,18 @@ def contrast(
         values = reading(first[scene, seed]), reading(second[scene, seed])
         if values[0] is not None and values[1] is not None:
             pairs.append(Pair(scene, seed, values[0], values[1]))
-    found = None
+    estimated = None
     if pairs:
         differences = [pair.difference for pair in pairs]
-        found = estimate(differences, [pair.scene for pair in pairs], quantity.margin)
-    return Contrast(*names, where, quantity, tuple(pairs), found)
+        estimated = estimate(differences, [pair.scene for pair in pairs], quantity.margin)
+    return Contrast(*names, where, quantity, tuple(pairs), estimated)
 
 
 def judged(contrasts: Iterable[Contrast]) -> tuple[Contrast, ...]:
     """Return the contrasts of one table with verdicts; contrasts without a pair are left out."""
-    family = [each for each in contrasts if each.estimate is not None]
-    found = verdicts([each.estimate for each in family if each.estimate is not None])
-    return tuple(replace(c, verdict=verdict) for c, verdict in zip(family, found, strict=True))
+    family = [row for row in contrasts if row.estimate is not None]
+    judgements = verdicts([row.estimate for row in family if row.estimate is not None])
+    return tuple(replace(c, verdict=verdict) for c, verdict in zip(family, judgements, strict=True))
 
 
 def couples(ranking: Sequence[str], baseline: str | None) -> list[tuple[str, str]]:

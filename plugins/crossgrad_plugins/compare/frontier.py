@@ -37,34 +37,34 @@ class Point:
 
 def points(cells: Cells, quantity: Quantity, costs: Sequence[Cost]) -> tuple[Point, ...]:
     """Return all points, ordered from short to long runs."""
-    found = []
+    all_points = []
     for length in cells.lengths:
         runs = cells.at(length)
         for arm, by in standings(runs, quantity).items():
             for scene, standing in by.items():
-                own = [run for (at, _), run in runs[arm].items() if at == scene]
-                amounts = {cost.name: [run.spent(cost) for run in own] for cost in costs}
+                on_scene = [run for (at, _), run in runs[arm].items() if at == scene]
+                amounts = {cost.name: [run.spent(cost) for run in on_scene] for cost in costs}
                 spent = {
-                    name: float(np.mean([each for each in values if each is not None]))
+                    name: float(np.mean([amount for amount in values if amount is not None]))
                     for name, values in amounts.items()
                     if None not in values
                 }
-                text = own[0].length_text
-                found.append(
+                text = on_scene[0].length_text
+                all_points.append(
                     Point(arm, scene, text, spent, standing.mean, standing.spread, standing.seeds)
                 )
-    return tuple(found)
+    return tuple(all_points)
 
 
 def gains(cells: Cells, quantity: Quantity) -> tuple[Contrast, ...]:
     """Compare, within each arm, runs of one length with runs of the next shorter length."""
-    found = []
+    contrasts = []
     for arm in cells.runs:
-        own = [length for length in cells.lengths if cells.at(length)[arm]]
-        for shorter, longer in pairwise(own):
+        lengths = [length for length in cells.lengths if cells.at(length)[arm]]
+        for shorter, longer in pairwise(lengths):
             if shorter[0] == longer[0]:
-                found.append(_gain(cells, quantity, arm, shorter, longer))
-    return judged(found)
+                contrasts.append(_gain(cells, quantity, arm, shorter, longer))
+    return judged(contrasts)
 
 
 def _gain(cells: Cells, quantity: Quantity, arm: str, shorter: Length, longer: Length) -> Contrast:

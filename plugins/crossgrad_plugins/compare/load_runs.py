@@ -77,11 +77,11 @@ def read_runs(places: Sequence[Path], *, skip_broken: bool) -> RunRecord:
     Raises:
         UserError: A folder contains no run, or a file of a run is damaged.
     """
-    found = RunRecord()
-    folders = list(dict.fromkeys(folder for place in places for folder in _folders(place)))
+    record = RunRecord()
+    folders = list(dict.fromkeys(folder for path in places for folder in _folders(path)))
     names = _short_names(folders)
     labels = {parent: _labels(parent) for parent in {folder.parent for folder in folders}}
-    for folder in dict.fromkeys(each for place in places for each in _headless(place)):
+    for folder in dict.fromkeys(headless for path in places for headless in _headless(path)):
         if not skip_broken:
             raise UserError(
                 "the folder contains results of a run, but no config.yaml",
@@ -89,17 +89,17 @@ def read_runs(places: Sequence[Path], *, skip_broken: bool) -> RunRecord:
                 todo="restore the file, or move the folder away; --skip-broken ignores this run "
                 "and compares the other runs",
             )
-        found.left_out[str(folder)] = "has no config.yaml"
+        record.left_out[str(folder)] = "has no config.yaml"
     for folder in folders:
         try:
             results = read_results(folder)
             for label in labels[folder.parent].get(folder.name, (None,)):
-                _sort_in(found, names[folder], results, label)
+                _sort_in(record, names[folder], results, label)
         except UserError as error:
             if not skip_broken:
                 raise _broken(error) from error
-            found.left_out[names[folder]] = f"{error.what}: {error.where}"
-    return found
+            record.left_out[names[folder]] = f"{error.what}: {error.where}"
+    return record
 
 
 def check_places(places: Sequence[Path]) -> None:
@@ -108,32 +108,32 @@ def check_places(places: Sequence[Path]) -> None:
     Raises:
         UserError: A path is a file, or does not exist.
     """
-    for place in places:
-        if not place.is_dir():
-            raise _no_run(place)
+    for path in places:
+        if not path.is_dir():
+            raise _no_run(path)
 
 
-def _folders(place: Path) -> Iterator[Path]:
-    found = find_runs(place) if place.is_dir() else ()
-    if not found:
-        raise _no_run(place)
-    yield from (folder.resolve() for folder in found)
+def _folders(path: Path) -> Iterator[Path]:
+    folders = find_runs(path) if path.is_dir() else ()
+    if not folders:
+        raise _no_run(path)
+    yield from (folder.resolve() for folder in folders)
 
 
-def _no_run(place: Path) -> UserError:
-    there = "a file" if place.is_file() else "the folder does not exist"
+def _no_run(path: Path) -> UserError:
+    there = "a file" if path.is_file() else "the folder does not exist"
     return UserError(
         "there is no run to compare",
-        where=place,
+        where=path,
         expected="the folder of a run, or a folder that contains runs",
-        found="no config.yaml" if place.is_dir() else there,
+        found="no config.yaml" if path.is_dir() else there,
         todo="name the folder that `crossgrad run` or `crossgrad sweep` printed",
     )
 
 
-def _headless(place: Path) -> Iterator[Path]:
+def _headless(root: Path) -> Iterator[Path]:
     """Yield folders in or below a folder that contain results of a run but not its config.yaml."""
-    for path in sorted(place.rglob("summary.json")):
+    for path in sorted(root.rglob("summary.json")):
         folder = path.parent
         if (folder / "metrics.csv").exists() and not (folder / "config.yaml").exists():
             yield folder.resolve()
@@ -149,22 +149,22 @@ def _broken(error: UserError) -> UserError:
     )
 
 
-def _sort_in(found: RunRecord, name: str, results: "RunResults", label: str | None) -> None:
+def _sort_in(record: RunRecord, name: str, results: "RunResults", label: str | None) -> None:
     if results.summary is None:
-        found.left_out[name] = "has not finished: no summary.json"
+        record.left_out[name] = "has not finished: no summary.json"
         return
     _check_summary(results)
     run = Run(name, results, results.summary, _config(results), label)
     if run.status == "failed":
-        found.failed.append(run)
-        found.left_out[name] = f"failed: {' '.join(str(run.summary.get('error')).split())}"
+        record.failed.append(run)
+        record.left_out[name] = f"failed: {' '.join(str(run.summary.get('error')).split())}"
     elif run.status != "finished":
-        found.left_out[name] = "was stopped before its end"
+        record.left_out[name] = "was stopped before its end"
     elif not results.rows and not (run.summary.get("overall") or {}).get("views"):
-        found.left_out[name] = "was never evaluated: metrics.csv has no row"
+        record.left_out[name] = "was never evaluated: metrics.csv has no row"
     else:
         _check_whole(results)
-        found.runs.append(run)
+        record.runs.append(run)
 
 
 def _check_whole(results: "RunResults") -> None:
@@ -212,16 +212,16 @@ def _check_whole(results: "RunResults") -> None:
 
 
 def _check_summary(results: "RunResults") -> None:
-    found = _OVERSIZED if _oversized(results.summary) else ""
+    problem = _OVERSIZED if _oversized(results.summary) else ""
     try:
         _Summary.model_validate(results.summary)
     except ValueError as error:
-        found = _in_words(error)
-    if found:
+        problem = _in_words(error)
+    if problem:
         raise UserError(
             "summary.json cannot be read",
             where=results.folder / "summary.json",
-            found=found,
+            found=problem,
             todo=_REPEAT,
         )
 
@@ -230,12 +230,12 @@ def _oversized(content: object) -> bool:
     """Return True if lists and objects contain a whole number that no float can represent."""
     rest = [content]
     while rest:
-        each = rest.pop()
-        if isinstance(each, Mapping):
-            rest += each.values()
-        elif isinstance(each, list):
-            rest += each
-        elif isinstance(each, int) and abs(each) > float_info.max:
+        item = rest.pop()
+        if isinstance(item, Mapping):
+            rest += item.values()
+        elif isinstance(item, list):
+            rest += item
+        elif isinstance(item, int) and abs(item) > float_info.max:
             return True
     return False
 
@@ -244,7 +244,9 @@ def _in_words(error: ValueError) -> str:
     if not isinstance(error, ValidationError):
         return " ".join(str(error).split())
     problems = error.errors(include_url=False, include_context=False)
-    return "; ".join(f"{'.'.join(map(str, each['loc']))}: {each['msg']}" for each in problems)
+    return "; ".join(
+        f"{'.'.join(map(str, problem['loc']))}: {problem['msg']}" for problem in problems
+    )
 
 
 def _config(results: "RunResults") -> dict[str, object]:
@@ -273,13 +275,13 @@ def _labels(folder: Path) -> dict[str, tuple[str, ...]]:
     if not {_ID, _LABEL} <= set(header):
         return {}
     at, called = header.index(_ID), header.index(_LABEL)
-    found: dict[str, tuple[str, ...]] = {}
+    labels: dict[str, tuple[str, ...]] = {}
     for line in lines:
         if len(line) == len(header):
-            found[line[at]] = tuple(
-                dict.fromkeys((*found.get(line[at], ()), without_length(line[called])))
+            labels[line[at]] = tuple(
+                dict.fromkeys((*labels.get(line[at], ()), without_length(line[called])))
             )
-    return found
+    return labels
 
 
 def without_length(label: str) -> str:

@@ -31,18 +31,18 @@ def headline(comparison: Comparison) -> tuple[Sentence, ...]:
         return (_alone(comparison),)
     if len(comparison.ends) == 1:
         only = comparison.ends[0]
-        found = [Sentence(claim(only), support(only))]
+        sentences = [Sentence(claim(only), support(only))]
     elif comparison.baseline is not None:
-        found = [Sentence(claim(each), support(each)) for each in comparison.ends]
+        sentences = [Sentence(claim(contrast), support(contrast)) for contrast in comparison.ends]
     else:
-        found = _of_the_best(comparison)
-    return (*found, *_lengths(comparison), *_equal_costs(comparison))
+        sentences = _of_the_best(comparison)
+    return (*sentences, *_lengths(comparison), *_equal_costs(comparison))
 
 
 def claim(contrast: Contrast) -> str:
     """Return the statement about two arms."""
-    found = contrast.estimate
-    if found is None:
+    estimate = contrast.estimate
+    if estimate is None:
         return f"{contrast.first} and {contrast.second} have no scene with the same seed in common"
     better = contrast.favours
     worse = contrast.second if better == contrast.first else contrast.first
@@ -53,7 +53,7 @@ def claim(contrast: Contrast) -> str:
     if contrast.verdict is Verdict.EQUIVALENT:
         both = f"{contrast.first} and {contrast.second}"
         return f"{both} are equivalent within {_margin(contrast)}{_except(contrast)}"
-    if found.center == 0.0:
+    if estimate.center == 0.0:
         return f"Inconclusive: no difference between {contrast.first} and {contrast.second}"
     return f"Inconclusive: {better} is {size} better than {worse}, which may be noise"
 
@@ -65,7 +65,8 @@ def _except(contrast: Contrast) -> str:
 def opposed_text(contrast: Contrast) -> str:
     """Return the scenes whose own intervals contradict the verdict, with their differences."""
     shown = [
-        f"{each.scene} ({contrast.quantity.difference(each.center)})" for each in contrast.opposed
+        f"{estimate.scene} ({contrast.quantity.difference(estimate.center)})"
+        for estimate in contrast.opposed
     ]
     return f"significantly the opposite on {', '.join(shown)}" if shown else ""
 
@@ -79,22 +80,22 @@ def where_text(contrast: Contrast) -> str:
 
 def verdict_text(contrast: Contrast) -> str:
     """Return the verdict, and the scenes whose own intervals contradict it."""
-    found = opposed_text(contrast)
-    return f"{contrast.verdict}, {found}" if found else str(contrast.verdict)
+    opposed = opposed_text(contrast)
+    return f"{contrast.verdict}, {opposed}" if opposed else str(contrast.verdict)
 
 
 def support(contrast: Contrast) -> str:
     """Return the evidence for the statement: interval, pairs and scenes."""
-    found = contrast.estimate
-    if found is None:
+    estimate = contrast.estimate
+    if estimate is None:
         return ""
     equivalent = contrast.verdict is Verdict.EQUIVALENT
-    interval = found.narrow if equivalent else found.wide
+    interval = estimate.narrow if equivalent else estimate.wide
     level = "90 %" if equivalent else "95 %"
-    parts = [f"{level} interval {interval_text(contrast, interval)}"] if found.pairs > 1 else []
-    pairs = count(found.pairs, "pair")
+    parts = [f"{level} interval {interval_text(contrast, interval)}"] if estimate.pairs > 1 else []
+    pairs = count(estimate.pairs, "pair")
     parts.append(f"{contrast.ahead} of {pairs} in favour of {contrast.first}")
-    parts.append(count(found.scenes, "scene"))
+    parts.append(count(estimate.scenes, "scene"))
     if contrast.verdict is Verdict.INCONCLUSIVE:
         parts.append(needed_text(contrast))
     return ", ".join(parts)
@@ -102,20 +103,20 @@ def support(contrast: Contrast) -> str:
 
 def needed_text(contrast: Contrast) -> str:
     """Return how many pairs would settle the comparison."""
-    found = contrast.estimate
-    if found is None or found.pairs == 1:
+    estimate = contrast.estimate
+    if estimate is None or estimate.pairs == 1:
         return _ONE_PAIR
     margin = _margin(contrast)
-    if found.needed is None:
+    if estimate.needed is None:
         return f"the noise is much larger than the margin of {margin}"
-    if found.needed <= found.pairs:
+    if estimate.needed <= estimate.pairs:
         if contrast.is_small or contrast.differs:
             return (
                 "significant alone, but not after the correction for the other comparisons "
                 "of the table"
             )
-        return f"the difference is too close to the margin of {margin} for {found.pairs} pairs"
-    return f"n ≥ {found.needed} pairs are needed to detect {margin} at this noise"
+        return f"the difference is too close to the margin of {margin} for {estimate.pairs} pairs"
+    return f"n ≥ {estimate.needed} pairs are needed to detect {margin} at this noise"
 
 
 def interval_text(contrast: Contrast, interval: tuple[float, float]) -> str:
@@ -130,12 +131,12 @@ def noise_sentence(comparison: Comparison) -> str:
     """Return the noise floor of each scene."""
     quantity = comparison.quantity
     lacking = [scene for scene in comparison.scenes if scene not in comparison.noise]
-    known = [
+    spreads = [
         f"{scene} {spread:.{quantity.decimals + 1}f}"
         for scene, (spread, _) in comparison.noise.items()
     ]
     unit = f" {quantity.unit}" if quantity.unit else ""
-    parts = [f"{', '.join(known)}{unit}"] if known else []
+    parts = [f"{', '.join(spreads)}{unit}"] if spreads else []
     if lacking:
         parts.append(f"unknown on {', '.join(lacking)}: only one seed")
     return "; ".join(parts)
@@ -147,9 +148,9 @@ def _alone(comparison: Comparison) -> Sentence:
     quantity = comparison.quantity
     by = comparison.standing[comparison.arms[0].name]
     finals = ", ".join(
-        f"{scene} {quantity.shown(each.mean)} {quantity.unit}".rstrip()
-        + ("" if isnan(each.spread) else f" \u00b1 {each.spread:.{quantity.decimals}f}")
-        for scene, each in by.items()
+        f"{scene} {quantity.shown(standing.mean)} {quantity.unit}".rstrip()
+        + ("" if isnan(standing.spread) else f" \u00b1 {standing.spread:.{quantity.decimals}f}")
+        for scene, standing in by.items()
     )
     return Sentence("There is only one arm, so nothing can be compared", finals)
 
@@ -179,35 +180,38 @@ def _of_the_best(comparison: Comparison) -> list[Sentence]:
     This arm leads by its mean over runs; the estimate from pairs can differ from this mean.
     """
     leader = comparison.ranking[0]
-    own = [each for each in comparison.ends if leader in {each.first, each.second}]
-    groups = {v: [c for c in own if c.verdict is v] for v in Verdict}
+    with_leader = [
+        contrast for contrast in comparison.ends if leader in {contrast.first, contrast.second}
+    ]
+    groups = {v: [c for c in with_leader if c.verdict is v] for v in Verdict}
     ahead = [c for c in groups[Verdict.DIFFERENT] if c.favours == leader]
     behind = [c for c in groups[Verdict.DIFFERENT] if c.favours != leader]
     support = f"better than {_against(ahead)}" if ahead else _NONE_BEATEN
-    found = [
+    sentences = [
         Sentence(f"{leader} {'has the best mean' if behind else 'is best at the end'}", support)
     ]
     if behind:
-        found.append(Sentence(f"It is worse than {_against(behind)}", "pair by pair"))
+        sentences.append(Sentence(f"It is worse than {_against(behind)}", "pair by pair"))
     for verdict, words in (
         (Verdict.EQUIVALENT, "equivalent to"),
         (Verdict.INCONCLUSIVE, "not distinguishable from"),
     ):
         if groups[verdict]:
-            found.append(
+            sentences.append(
                 Sentence(
-                    f"It is {words} {_named(each.second for each in groups[verdict])}",
+                    f"It is {words} {_named(contrast.second for contrast in groups[verdict])}",
                     _why(groups[verdict]),
                 )
             )
-    return found
+    return sentences
 
 
 def _against(contrasts: Sequence[Contrast]) -> str:
     return _named(
-        f"{each.second} by {_size(each)} ({interval_text(each, each.estimate.wide)})"
-        for each in contrasts
-        if each.estimate is not None
+        f"{contrast.second} by {_size(contrast)} "
+        f"({interval_text(contrast, contrast.estimate.wide)})"
+        for contrast in contrasts
+        if contrast.estimate is not None
     )
 
 
@@ -228,16 +232,18 @@ def _why(contrasts: Sequence[Contrast]) -> str:
 
 def _lengths(comparison: Comparison) -> list[Sentence]:
     """Return a sentence if runs of a scene and seed have different lengths in two arms."""
-    told: dict[str, dict[str, None]] = {}
+    lengths: dict[str, dict[str, None]] = {}
     for problem in {problem for by in comparison.main.values() for problem in by}:
-        own = {n: by[problem].length_text for n, by in comparison.main.items() if problem in by}
-        if len(set(own.values())) > 1:
-            for name, length in own.items():
-                told.setdefault(name, {})[length] = None
-    if not told:
+        by_arm = {n: by[problem].length_text for n, by in comparison.main.items() if problem in by}
+        if len(set(by_arm.values())) > 1:
+            for name, length in by_arm.items():
+                lengths.setdefault(name, {})[length] = None
+    if not lengths:
         return []
     shown = (
-        f"{name} {', '.join(sorted(told[name]))}" for name in comparison.ranking if name in told
+        f"{name} {', '.join(sorted(lengths[name]))}"
+        for name in comparison.ranking
+        if name in lengths
     )
     return [Sentence("The arms had different lengths", _named(shown, "; "))]
 
@@ -248,9 +254,11 @@ def _equal_costs(comparison: Comparison) -> list[Sentence]:
         return []
     couple = comparison.ends[0].first, comparison.ends[0].second
     return [
-        Sentence(f"At equal {_TITLES[each.where]}: {_lowered(claim(each))}", support(each))
-        for each in comparison.equal
-        if (each.first, each.second) == couple
+        Sentence(
+            f"At equal {_TITLES[contrast.where]}: {_lowered(claim(contrast))}", support(contrast)
+        )
+        for contrast in comparison.equal
+        if (contrast.first, contrast.second) == couple
     ]
 
 

@@ -36,12 +36,12 @@ def check_free(folder: Path, owned: Iterable[str] = ()) -> None:
     check_folder(folder)
     if not folder.is_dir() or is_comparison(folder):
         return
-    known = {PAGE, *owned} if (folder / FIGURES).is_dir() else set()
+    allowed = {PAGE, *owned} if (folder / FIGURES).is_dir() else set()
     there = (*folder.glob("*"), *(folder / FIGURES).glob("*"))
     others = (
         path
         for path in there
-        if path.relative_to(folder).as_posix() not in {*known, FIGURES} and not is_leftover(path)
+        if path.relative_to(folder).as_posix() not in {*allowed, FIGURES} and not is_leftover(path)
     )
     if next(others, None) is None and not (folder / PAGE).exists():
         return
@@ -79,7 +79,7 @@ def write_files(folder: Path, files: Mapping[str, bytes], owned: Iterable[str]) 
         for name in owned:
             if name not in files:
                 (folder / name).unlink(missing_ok=True)
-    for place in (folder, folder / FIGURES):
-        clear_half_written(place, shared=True)
+    for directory in (folder, folder / FIGURES):
+        clear_half_written(directory, shared=True)
     for name in sorted(files, key=lambda name: name == PAGE):
         write_atomically(folder / name, files[name])

@@ -62,7 +62,7 @@ class WorstView:
 
 def worst_views(comparison: Comparison) -> dict[str, list[WorstView]]:
     """Return scene -> its held-out views, the worst first, without pictures."""
-    found: dict[str, list[WorstView]] = {}
+    by_scene: dict[str, list[WorstView]] = {}
     for scene in comparison.scenes:
         values: dict[tuple[str, str], dict[str, list[float]]] = {}
         for arm, by in comparison.main.items():
@@ -70,16 +70,16 @@ def worst_views(comparison: Comparison) -> dict[str, list[WorstView]]:
                 for view in run.results.views if at == scene else ():
                     value = view.values.get(comparison.quantity.name)
                     if value is not None and np.isfinite(value):
-                        own = values.setdefault((view.name, view.regime), {})
-                        own.setdefault(arm, []).append(value)
+                        arm_values = values.setdefault((view.name, view.regime), {})
+                        arm_values.setdefault(arm, []).append(value)
         views = [_view(scene, *view, by_arm) for view, by_arm in values.items()]
         sign = -1.0 if comparison.quantity.falls else 1.0
-        found[scene] = sorted(views, key=lambda view: sign * view.mean)
-    return found
+        by_scene[scene] = sorted(views, key=lambda view: sign * view.mean)
+    return by_scene
 
 
 def _view(scene: str, name: str, regime: str, values: Mapping[str, Sequence[float]]) -> WorstView:
-    means = {arm: float(np.mean(own)) for arm, own in values.items()}
+    means = {arm: float(np.mean(arm_values)) for arm, arm_values in values.items()}
     return WorstView(scene, name, regime, float(np.mean(list(means.values()))), means)
 
 
@@ -93,18 +93,20 @@ def with_pictures(
     """
     shown: list[tuple[WorstView, list[tuple[str, Run]]]] = []
     share = min(MOST_OF_A_SCENE, max(1, MOST_VIEWS // max(1, len(views))))
-    for scene, own in views.items():
+    for scene, scene_views in views.items():
         runs = _runs_of(comparison, scene)
         kept = {run.name: _paths(run) for _, run in runs}
-        drawn = [view for view in own if runs and all(view.name in kept[r.name] for _, r in runs)]
+        drawn = [
+            view for view in scene_views if runs and all(view.name in kept[r.name] for _, r in runs)
+        ]
         shown += [(view, runs) for view in drawn[:share]]
     for width in _WIDTHS:
         notes: list[str] = []
-        found = [_pictured(comparison, view, runs, width, notes) for view, runs in shown]
-        size = sum(len(p.render) + len(p.error) for view in found for p in view.pictures)
+        pictured = [_pictured(comparison, view, runs, width, notes) for view, runs in shown]
+        size = sum(len(p.render) + len(p.error) for view in pictured for p in view.pictures)
         if size <= MOST_BYTES:
             break
-    return [view for view in found if view.pictures], list(dict.fromkeys(notes))
+    return [view for view in pictured if view.pictures], list(dict.fromkeys(notes))
 
 
 def _runs_of(comparison: Comparison, scene: str) -> list[tuple[str, Run]]:
@@ -132,7 +134,7 @@ def _pictured(
     pictures: list[Picture] = []
     for arm, run in runs:
         step = int(run.number("step") or 0)
-        names = [each.name for each in run.results.views]
+        names = [run_view.name for run_view in run.results.views]
         try:
             panel = read_panel(panels_of(run.results.folder, step, names)[view.name])
         except UserError as error:

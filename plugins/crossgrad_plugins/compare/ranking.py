@@ -29,15 +29,15 @@ def standings(
     runs: Mapping[str, Runs], quantity: Quantity, regime: str | None = None
 ) -> dict[str, dict[str, Standing]]:
     """Return arm -> scene -> its metric; a scene is absent if no run has the metric there."""
-    found: dict[str, dict[str, Standing]] = {}
+    by_arm: dict[str, dict[str, Standing]] = {}
     for arm, by in runs.items():
-        own: dict[str, list[float]] = {}
+        by_scene: dict[str, list[float]] = {}
         for (scene, _), run in by.items():
             value = run.final(quantity.name, regime)
             if value is not None:
-                own.setdefault(scene, []).append(value)
-        found[arm] = {scene: _standing(values) for scene, values in sorted(own.items())}
-    return found
+                by_scene.setdefault(scene, []).append(value)
+        by_arm[arm] = {scene: _standing(values) for scene, values in sorted(by_scene.items())}
+    return by_arm
 
 
 def _standing(values: Sequence[float]) -> Standing:
@@ -84,11 +84,11 @@ def noise(
     sums: dict[str, tuple[float, int]] = {}
     counted: set[frozenset[str]] = set()
     for arm, by in standing.items():
-        for scene, each in by.items():
-            own = frozenset(run.name for (at, _), run in runs[arm].items() if at == scene)
-            if each.seeds > 1 and own not in counted:
-                counted.add(own)
+        for scene, result in by.items():
+            run_names = frozenset(run.name for (at, _), run in runs[arm].items() if at == scene)
+            if result.seeds > 1 and run_names not in counted:
+                counted.add(run_names)
                 total, freedom = sums.get(scene, (0.0, 0))
-                more = each.seeds - 1
-                sums[scene] = total + more * each.spread**2, freedom + more
+                more = result.seeds - 1
+                sums[scene] = total + more * result.spread**2, freedom + more
     return {scene: (sqrt(total / freedom), freedom) for scene, (total, freedom) in sums.items()}

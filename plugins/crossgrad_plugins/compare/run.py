@@ -98,9 +98,9 @@ class Run:
     def series(self, name: str, cost: Cost, regime: str | None = None) -> tuple[Array, Array]:
         """Return the cost at each evaluation [n], ascending, and the figure at each of them [n]."""
         points = self.results.curve(name, regime, over=cost.column)
-        known = {x: y for x, y in points if isfinite(x) and isfinite(y)}
-        x = np.array(sorted(known), dtype=np.float64)
-        return x, np.array([known[each] for each in sorted(known)], dtype=np.float64)
+        values = {x: y for x, y in points if isfinite(x) and isfinite(y)}
+        x = np.array(sorted(values), dtype=np.float64)
+        return x, np.array([values[amount] for amount in sorted(values)], dtype=np.float64)
 
     def spent(self, cost: Cost) -> float | None:
         """Return the total cost; None if it was not recorded."""
@@ -112,8 +112,10 @@ class Run:
         value: Any = self.summary
         for name in names:
             value = value.get(name) if isinstance(value, Mapping) else None
-        known = isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
-        return float(value) if known else None
+        is_number = (
+            isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
+        )
+        return float(value) if is_number else None
 
 
 def text_of(length: tuple[str, float]) -> str:
@@ -139,8 +141,8 @@ def _flat(name: str, value: object) -> Iterator[tuple[str, object]]:
     if isinstance(value, Mapping):
         for key, inner in value.items():
             yield from _flat(name if key == "name" and name else f"{name}.{key}".strip("."), inner)
-    elif isinstance(value, list) and any(isinstance(each, Mapping) for each in value):
-        links = [each for each in value if isinstance(each, Mapping)]
+    elif isinstance(value, list) and any(isinstance(item, Mapping) for item in value):
+        links = [item for item in value if isinstance(item, Mapping)]
         yield name, "+".join(str(link.get("name")) for link in links)
         for number, link in enumerate(links):
             options = {key: inner for key, inner in link.items() if key != "name"}
@@ -157,5 +159,5 @@ def _text(value: object) -> str:
     if isinstance(value, float):
         return f"{value:g}"
     if isinstance(value, list):
-        return ",".join(_text(each) for each in value)
+        return ",".join(_text(item) for item in value)
     return str(value)

@@ -69,13 +69,13 @@ class Bootstrap:
         rng = np.random.default_rng(_SEED)
         strata = _strata(scenes)
         stretched, resampled = np.empty(len(values)), np.empty((DRAWS, len(values)))
-        of_two = [each for each in strata if len(each) == _TWO]
+        of_two = [indices for indices in strata if len(indices) == _TWO]
         pool = _deviations(values, of_two)
         for stratum in strata:
-            own, count = values[stratum], len(stratum)
+            sample, count = values[stratum], len(stratum)
             stretch = sqrt(count / (count - 1)) if count > 1 else 1.0
-            stretched[stratum] = own.mean() + stretch * (own - own.mean())
-            source = own.mean() + pool if count == _TWO else stretched[stratum]
+            stretched[stratum] = sample.mean() + stretch * (sample - sample.mean())
+            source = sample.mean() + pool if count == _TWO else stretched[stratum]
             drawn = rng.integers(0, len(source), (DRAWS, count))
             resampled[:, stratum] = source[drawn]
         draws = iqm(resampled) + (iqm(values) - iqm(stretched))
@@ -107,18 +107,18 @@ class Bootstrap:
         from scipy.special import ndtri, stdtr
 
         least = 0.5 / DRAWS
-        place = float(ndtri(min(max(share, least), 1.0 - least)))
+        score = float(ndtri(min(max(share, least), 1.0 - least)))
         if share < least:
             spread = float(self.draws.std())
-            place = min(place, -distance / spread) if spread > 0.0 else -inf
-        return float(stdtr(self.freedom, place))
+            score = min(score, -distance / spread) if spread > 0.0 else -inf
+        return float(stdtr(self.freedom, score))
 
 
 def _deviations(
     values: NDArray[np.float64], strata: Sequence[NDArray[np.intp]]
 ) -> NDArray[np.float64]:
     """Return the stretched deviations of scenes with two pairs from the means of their scenes."""
-    deviations = [sqrt(_TWO) * (values[each] - values[each].mean()) for each in strata]
+    deviations = [sqrt(_TWO) * (values[stratum] - values[stratum].mean()) for stratum in strata]
     return np.concatenate(deviations) if deviations else np.zeros(0)
 
 
@@ -132,8 +132,8 @@ def _share(draws: NDArray[np.float64], border: float) -> float:
 def _strata(scenes: Sequence[str]) -> list[NDArray[np.intp]]:
     names = np.asarray(scenes)
     strata = [np.flatnonzero(names == name) for name in dict.fromkeys(scenes)]
-    single = [each for each in strata if len(each) == 1]
-    several = [each for each in strata if len(each) > 1]
+    single = [stratum for stratum in strata if len(stratum) == 1]
+    several = [stratum for stratum in strata if len(stratum) > 1]
     return [*several, np.concatenate(single)] if single else several
 
 
@@ -287,9 +287,9 @@ def _by_scene(values: NDArray[np.float64], scenes: Sequence[str]) -> tuple[Scene
     names = np.asarray(scenes)
     of_scene = {scene: values[names == scene] for scene in dict.fromkeys(scenes)}
     return tuple(
-        SceneEstimate(scene, float(own.mean()), _floats(student(own).interval(WIDE)))
-        for scene, own in of_scene.items()
-        if 1 < len(own) < len(values)
+        SceneEstimate(scene, float(sample.mean()), _floats(student(sample).interval(WIDE)))
+        for scene, sample in of_scene.items()
+        if 1 < len(sample) < len(values)
     )
 
 
@@ -313,12 +313,12 @@ def verdicts(family: Sequence[Estimate]) -> list[Verdict]:
     corrected with Holm's method, must also be below its level.
     """
     if len(family) <= UNCORRECTED:
-        return [_verdict(each.differs, each.is_small) for each in family]
-    different = corrected([each.p_different for each in family])
-    equivalent = corrected([each.p_equivalent for each in family])
+        return [_verdict(member.differs, member.is_small) for member in family]
+    different = corrected([member.p_different for member in family])
+    equivalent = corrected([member.p_equivalent for member in family])
     return [
-        _verdict(each.differs and p < 1.0 - WIDE, each.is_small and q < (1.0 - NARROW) / 2.0)
-        for each, p, q in zip(family, different, equivalent, strict=True)
+        _verdict(member.differs and p < 1.0 - WIDE, member.is_small and q < (1.0 - NARROW) / 2.0)
+        for member, p, q in zip(family, different, equivalent, strict=True)
     ]
 
 
@@ -332,10 +332,10 @@ def holm(values: Sequence[float]) -> list[float]:
 
     NaN is the p-value of a test that was not made: it is returned unchanged and not counted.
     """
-    known = sorted((value, index) for index, value in enumerate(values) if not isnan(value))
+    ranked = sorted((value, index) for index, value in enumerate(values) if not isnan(value))
     adjusted, largest = list(values), 0.0
-    for rank, (value, index) in enumerate(known):
-        largest = max(largest, min(1.0, (len(known) - rank) * value))
+    for rank, (value, index) in enumerate(ranked):
+        largest = max(largest, min(1.0, (len(ranked) - rank) * value))
         adjusted[index] = largest
     return adjusted
 
@@ -350,12 +350,12 @@ def opposed(found: Estimate, verdict: Verdict, margin: float) -> tuple[SceneEsti
         return ()
     sign = 1.0 if found.center > 0.0 else -1.0
     return tuple(
-        each
-        for each in found.by_scene
+        scene_estimate
+        for scene_estimate in found.by_scene
         if (
-            max(sign * limit for limit in each.wide) < 0.0
+            max(sign * limit for limit in scene_estimate.wide) < 0.0
             if verdict is Verdict.DIFFERENT
-            else each.wide[0] > margin or each.wide[1] < -margin
+            else scene_estimate.wide[0] > margin or scene_estimate.wide[1] < -margin
         )
     )
 

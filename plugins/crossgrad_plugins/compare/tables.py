@@ -93,13 +93,13 @@ def _standing(c: Comparison, arm: str, scene: str) -> str:
 
 def _against(c: Comparison, arm: str, reference: str) -> tuple[str, str]:
     """Return the arm's difference from the reference, and the verdict."""
-    for each in c.ends:
-        if each.estimate is not None and {each.first, each.second} == {arm, reference}:
-            sign = 1.0 if each.first == arm else -1.0
-            low, high = sorted(sign * limit for limit in each.estimate.wide)
-            interval = interval_text(each, (low, high)).removesuffix(each.quantity.unit)
-            text = c.quantity.difference(sign * each.estimate.center)
-            return f"{text} [{interval.strip()}]", str(each.verdict)
+    for contrast in c.ends:
+        if contrast.estimate is not None and {contrast.first, contrast.second} == {arm, reference}:
+            sign = 1.0 if contrast.first == arm else -1.0
+            low, high = sorted(sign * limit for limit in contrast.estimate.wide)
+            interval = interval_text(contrast, (low, high)).removesuffix(contrast.quantity.unit)
+            text = c.quantity.difference(sign * contrast.estimate.center)
+            return f"{text} [{interval.strip()}]", str(contrast.verdict)
     return ("reference" if arm == reference else "no pair"), ""
 
 
@@ -111,7 +111,7 @@ def cost_table(c: Comparison) -> Table:
     for arm in c.ranking:
         runs = [run for problem, run in c.main[arm].items() if problem in shared]
         runs = runs or list(c.main[arm].values())
-        failed = next(len(each.failed) for each in c.arms if each.name == arm)
+        failed = next(len(arm_record.failed) for arm_record in c.arms if arm_record.name == arm)
         row = [arm, *(_mean([run.spent(cost) for run in runs], cost) for cost in c.costs)]
         row += [
             _mean([run.number("primitives") for run in runs]),
@@ -127,10 +127,10 @@ def cost_table(c: Comparison) -> Table:
 
 
 def _mean(values: Sequence[float | None], cost: Cost | None = None) -> str:
-    known = [value for value in values if value is not None]
-    if not known:
+    numbers = [value for value in values if value is not None]
+    if not numbers:
         return _NONE
-    mean = float(np.mean(known))
+    mean = float(np.mean(numbers))
     return f"{mean:,.0f}" if cost is None else cost.shown(mean).removesuffix(f" {cost.unit}")
 
 
@@ -157,7 +157,7 @@ def contrast_tables(c: Comparison) -> tuple[Table, ...]:
             c.others,
             "Other figures",
             "At the end of the runs, over all held-out views.",
-            {"figure": lambda each: each.quantity.label},
+            {"figure": lambda contrast: contrast.quantity.label},
         ),
         contrast_table(
             c.gains,
@@ -196,9 +196,12 @@ def contrast_table(
         *(Column("pairs"), Column("first better"), Column("", "note", in_terminal=False)),
     ]
     rows = [
-        [*(text(each) for text in first.values()), *_contrast_texts(each, each.estimate)]
-        for each in contrasts
-        if each.estimate is not None
+        [
+            *(text(contrast) for text in first.values()),
+            *_contrast_texts(contrast, contrast.estimate),
+        ]
+        for contrast in contrasts
+        if contrast.estimate is not None
     ]
     return Table(columns, rows, title, caption)
 
@@ -226,16 +229,16 @@ def _contrast_texts(contrast: Contrast, estimate: Estimate) -> list[str]:
 def reached_table(c: Comparison) -> Table:
     """Return the cost to reach a quality: a row for each scene and arm, a cell for each cost."""
     groups: dict[tuple[str, str], list[Reached]] = {}
-    for each in c.reached:
-        groups.setdefault((each.scene, each.arm), []).append(each)
+    for row in c.reached:
+        groups.setdefault((row.scene, row.arm), []).append(row)
     rows = [
         [
-            *(scene, c.quantity.shown(own[0].target), arm),
-            *(each.cost.shown(each.median) if isfinite(each.median) else "never (\u221e)"
-              for each in own),
-            f"{own[-1].reached} of {len(own[-1].amounts)}",
+            *(scene, c.quantity.shown(group[0].target), arm),
+            *(row.cost.shown(row.median) if isfinite(row.median) else "never (\u221e)"
+              for row in group),
+            f"{group[-1].reached} of {len(group[-1].amounts)}",
         ]
-        for (scene, arm), own in groups.items()
+        for (scene, arm), group in groups.items()
     ]  # fmt: skip
     columns = [Column("scene", "text"), Column(c.quantity.with_unit), _ARM]
     columns += [Column(cost.title) for cost in c.costs]
@@ -304,12 +307,12 @@ def csv_tables(c: Comparison, views: Mapping[str, Sequence[WorstView]]) -> dict[
     return {
         "runs.csv": [_run(c, arm.name, run) for arm in c.arms for run in arm.runs],
         "arms.csv": [{"arm": arm.name, **arm.settings} for arm in c.arms],
-        "comparisons.csv": [_contrast(each) for each in contrasts],
+        "comparisons.csv": [_contrast(contrast) for contrast in contrasts],
         "pairs.csv": [
-            {**_named(each), "scene": pair.scene, "seed": pair.seed, "of_first": pair.first,
+            {**_named(contrast), "scene": pair.scene, "seed": pair.seed, "of_first": pair.first,
              "of_second": pair.second, "difference": pair.difference}
-            for each in contrasts
-            for pair in each.pairs
+            for contrast in contrasts
+            for pair in contrast.pairs
         ],
         "time_to_quality.csv": [
             {"cost": row.cost.name, "scene": row.scene, "target": row.target, "arm": row.arm,
@@ -327,11 +330,11 @@ def csv_tables(c: Comparison, views: Mapping[str, Sequence[WorstView]]) -> dict[
             {"scene": scene, "deviation": deviation, "degrees_of_freedom": freedom}
             for scene, (deviation, freedom) in c.noise.items()
         ],
-        "phases.csv": [{"arm": arm, **own} for arm, own in phases_of(c).items()],
+        "phases.csv": [{"arm": arm, **phases} for arm, phases in phases_of(c).items()],
         "views.csv": [
             {"scene": v.scene, "view": v.name, "regime": v.regime, "mean": v.mean, **v.by_arm}
-            for own in views.values()
-            for v in own
+            for scene_views in views.values()
+            for v in scene_views
         ],
     }  # fmt: skip
 
@@ -373,7 +376,7 @@ def _contrast(contrast: Contrast) -> Row:
         "low_90": estimate.narrow[0],
         "high_90": estimate.narrow[1],
         "verdict": str(contrast.verdict),
-        "opposed": " ".join(each.scene for each in contrast.opposed),
+        "opposed": " ".join(opposing.scene for opposing in contrast.opposed),
         "margin": contrast.quantity.margin,
         "pairs": estimate.pairs,
         "first_better": contrast.ahead,

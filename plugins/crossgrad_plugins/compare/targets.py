@@ -88,12 +88,12 @@ def reached(
     for scene, target in targets.items():
         for arm, by in runs.items():
             never = {seed: inf for at, seed in failed[arm] if at == scene}
-            found = {
+            by_seed = {
                 seed: cost_to(run, quantity, cost, target)
                 for (at, seed), run in sorted(by.items())
                 if at == scene
             }
-            if amounts := {**never, **found}:
+            if amounts := {**never, **by_seed}:
                 rows.append(Reached(cost, scene, target, arm, amounts))
     return tuple(rows)
 
@@ -139,8 +139,8 @@ def value_at(run: Run, quantity: Quantity, cost: Cost, amount: float) -> float |
 def shared_amount(runs: Iterable[Run], quantity: Quantity, cost: Cost) -> float | None:
     """Return the smallest final cost of all runs; None if a run was never evaluated."""
     ends = [x[-1] if len(x := run.series(quantity.name, cost)[0]) else None for run in runs]
-    known = [float(end) for end in ends if end is not None]
-    return min(known) if known and len(known) == len(ends) else None
+    amounts = [float(end) for end in ends if end is not None]
+    return min(amounts) if amounts and len(amounts) == len(ends) else None
 
 
 def is_inside(run: Run, quantity: Quantity, cost: Cost, amount: float) -> bool:

@@ -197,13 +197,13 @@ def made_or_ready(photos: Path, scene: Path, settings: Settings) -> list[str]:
         why = f"{layout.work} is missing, which records how the scene was made"
     elif layout.is_ready and not has_photos(photos):
         why = f"{photos} no longer contains photos"
-    told = (
+    messages = (
         [f"{why}: the scene is used unchanged"]
         if why
         else summary_lines(prepared(photos, scene, settings))
     )
     able = [name for name in entries("readers") if accepts(name, photos)]
-    return told + [
+    return messages + [
         (
             f"the folder already has poses (reader {name}), which are not used; leave "
             "--prepare out to train with them"
@@ -217,20 +217,20 @@ def _check_lens(name: str) -> None:
     import pycolmap
 
     unknown = {"INVALID", _ALL_AROUND}
-    known = [each for each in pycolmap.CameraModelId.__members__ if each not in unknown]
+    lenses = [model for model in pycolmap.CameraModelId.__members__ if model not in unknown]
     if name == _ALL_AROUND:
         raise UserError(
             "360-degree photos cannot be undistorted to a pinhole camera",
             where="--lens",
-            expected=", ".join(known),
+            expected=", ".join(lenses),
             found=name,
             todo="cut them into perspective photos, and prepare these photos",
         )
-    if name not in known:
+    if name not in lenses:
         raise UserError(
             "the camera model is unknown",
             where="--lens",
-            expected=", ".join(known),
+            expected=", ".join(lenses),
             found=name,
             todo="leave the option out to use SIMPLE_RADIAL",
         )
@@ -264,9 +264,9 @@ def _carried_out(layout: Layout, plan: Plan, threads: int) -> Report:
 
 def _timed(what: str, stage: Callable[[], T]) -> T:
     begun = monotonic()
-    found = stage()
+    result = stage()
     Progress().tell(f"{what}: {monotonic() - begun:.0f} s")
-    return found
+    return result
 
 
 def _write_report(layout: Layout, report: Report) -> None:

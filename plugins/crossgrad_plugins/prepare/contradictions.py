@@ -59,7 +59,7 @@ def contradicted(
     Returns:
         Number of each such photo -> its matches for and against the pose.
     """
-    votes, found = _votes(model, database), dict[int, tuple[int, int]]()
+    votes, misplaced = _votes(model, database), dict[int, tuple[int, int]]()
     counts = _Counts(max(model.reg_image_ids(), default=0) + 1)
     present = np.ones(len(votes.matches), dtype=np.bool_)
     while present.any():
@@ -69,9 +69,9 @@ def contradicted(
         worst = int(np.argmin(weighed))
         if weighed[worst] >= _SHARE:
             break
-        found[worst] = int(yes[0][worst]), int(no[0][worst])
+        misplaced[worst] = int(yes[0][worst]), int(no[0][worst])
         present &= (votes.photos != worst).all(axis=1)
-    return found
+    return misplaced
 
 
 @dataclass(frozen=True)

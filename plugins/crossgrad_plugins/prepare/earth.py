@@ -30,18 +30,18 @@ _UPRIGHT: Final = 0.3
 
 def origin_of(plan: Plan) -> Position | None:
     """Return the median position of the photos, or None if no photo has GPS."""
-    places = [photo.position for photo in plan.located if photo.position is not None]
-    if not places:
+    positions = [photo.position for photo in plan.located if photo.position is not None]
+    if not positions:
         return None
-    longitudes = [place.longitude for place in places]
+    longitudes = [position.longitude for position in positions]
     if max(longitudes) - min(longitudes) > _HALF:
         # The photos are on both sides of the date line.
-        longitudes = [each % (2 * _HALF) for each in longitudes]
+        longitudes = [longitude % (2 * _HALF) for longitude in longitudes]
     east = median(longitudes)
     return Position(
-        latitude=median(place.latitude for place in places),
+        latitude=median(position.latitude for position in positions),
         longitude=east - 2 * _HALF if east > _HALF else east,
-        altitude=median(place.altitude for place in places),
+        altitude=median(position.altitude for position in positions),
     )
 
 
@@ -55,12 +55,14 @@ def local_positions(plan: Plan) -> dict[str, NDArray[np.float64]]:
     return dict(zip(names, _to_local(places, origin), strict=True))
 
 
-def _to_local(places: Sequence[Position], origin: Position) -> NDArray[np.float64]:
+def _to_local(positions: Sequence[Position], origin: Position) -> NDArray[np.float64]:
     """Return positions [N, 3] in metres east, north and up of the origin."""
     guard_pycolmap()
     import pycolmap
 
-    angles = np.array([[each.latitude, each.longitude, each.altitude] for each in places])
+    angles = np.array(
+        [[position.latitude, position.longitude, position.altitude] for position in positions]
+    )
     transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
     return np.asarray(
         transform.ellipsoid_to_enu(angles, origin.latitude, origin.longitude, origin.altitude)

@@ -56,23 +56,23 @@ def found_features(layout: Layout, plan: Plan, threads: int) -> dict[str, int]:
         if asked:
             _find(layout, plan, asked, _options(plan, longest, threads, faint=faint))
     counts = _counts(layout.database)
-    found = {name: counts.get(name, 0) for name in names}
-    if not any(found.values()):
+    by_photo = {name: counts.get(name, 0) for name in names}
+    if not any(by_photo.values()):
         raise UserError(
             "no features were found in any photo",
             where=plan.photos,
             expected="sharp, textured photos that are neither black nor white",
             todo="check the photos, or name another folder",
         )
-    write_atomically(layout.features, json.dumps(found, indent=1).encode())
-    return found
+    write_atomically(layout.features, json.dumps(by_photo, indent=1).encode())
+    return by_photo
 
 
 def _room(layout: Layout, plan: Plan) -> int:
     """Return the bytes that missing features need, because SQLite aborts on a full disk."""
     done = rows_of(layout.database, "descriptors") if layout.database.is_file() else 0
-    each = int(_ORIENTATIONS * plan.settings.max_features) * _BYTES_OF_FEATURE
-    return max(0, len(plan.used) - done) * each + JOURNAL
+    bytes_per_photo = int(_ORIENTATIONS * plan.settings.max_features) * _BYTES_OF_FEATURE
+    return max(0, len(plan.used) - done) * bytes_per_photo + JOURNAL
 
 
 def _options(

@@ -102,7 +102,7 @@ def lost_photos(
             inside |= names
         else:
             elsewhere |= dict.fromkeys(names, len(names))
-    usual = median(features.values())
+    typical = median(features.values())
     sharp = median(photo.sharpness for photo in plan.used)
     return tuple(
         Lost(
@@ -113,7 +113,7 @@ def lost_photos(
             if photo.name in elsewhere
             else _contradicted(*misplaced[photo.name])
             if photo.name in misplaced
-            else _why(photo, features[photo.name], partners[photo.name], (usual, sharp)),
+            else _why(photo, features[photo.name], partners[photo.name], (typical, sharp)),
         )
         for photo in plan.used
         if photo.name not in inside
@@ -128,19 +128,19 @@ def _contradicted(agreeing: int, against: int) -> str:
     )
 
 
-def _why(photo: Photo, features: int, partners: int, usual: tuple[float, float]) -> str:
+def _why(photo: Photo, features: int, partners: int, typical: tuple[float, float]) -> str:
     """Return why a photo may have no pose: first defects of the photo, then missing matches."""
     reasons = []
     if photo.brightness < _DARK:
         reasons.append(f"dark (mean grey level {photo.brightness:.0f} of 255)")
     if photo.brightness > _BRIGHT:
         reasons.append(f"overexposed (mean grey level {photo.brightness:.0f} of 255)")
-    if photo.sharpness < _BLURRED_SHARE * usual[1]:
+    if photo.sharpness < _BLURRED_SHARE * typical[1]:
         reasons.append("blurred, or without texture")
     if features == 0:
         reasons.append("no features were found")
-    elif features < max(_FEW, _LOW_SHARE * usual[0]):
-        reasons.append(f"few features ({features}; typical: {usual[0]:.0f})")
+    elif features < max(_FEW, _LOW_SHARE * typical[0]):
+        reasons.append(f"few features ({features}; typical: {typical[0]:.0f})")
     if features and not partners:
         reasons.append("no verified matches with any other photo")
     elif partners:
@@ -222,8 +222,8 @@ def _bridge(
 
 
 def _middle(names: Iterable[str], heights: Mapping[str, float]) -> float | None:
-    known = [heights[name] for name in names if name in heights]
-    return median(known) if known else None
+    metres = [heights[name] for name in names if name in heights]
+    return median(metres) if metres else None
 
 
 def _folders(plan: Plan, names: Iterable[str]) -> str:

@@ -73,12 +73,12 @@ def placement_of(
         return None, f"{len(names)} of its photos have GPS, but at least {FEWEST} are needed"
     here = np.array([centers[name] for name in names])
     there = np.array([positions[name] for name in names])
-    found = _aligned(here, there) or _on_a_line(here, there)
-    if found is None:
+    alignment = _aligned(here, there) or _on_a_line(here, there)
+    if alignment is None:
         return None, (
             "GPS and poses do not agree: no similarity transform brings most photos within 30 m"
         )
-    similarity, agrees = found
+    similarity, agrees = alignment
     agreeing = frozenset(name for name, good in zip(names, agrees, strict=True) if good)
     residuals = dict(zip(names, _moved(similarity, here) - there, strict=True))
     placement = Placement(similarity, residuals, agreeing)
@@ -129,14 +129,14 @@ def _aligned(
     for error in _ERRORS:
         options.max_error = error
         with quiet():
-            found: Any = pycolmap.estimate_sim3d_robust(here, there, options)
-        if not found:
+            estimate: Any = pycolmap.estimate_sim3d_robust(here, there, options)
+        if not estimate:
             continue
-        agrees = np.asarray(found["inlier_mask"], dtype=np.bool_)
+        agrees = np.asarray(estimate["inlier_mask"], dtype=np.bool_)
         if agrees.sum() < max(FEWEST, _AGREEING * len(here)):
             continue
         refined = pycolmap.estimate_sim3d(here[agrees], there[agrees])
-        return (refined or found["tgt_from_src"]), agrees
+        return (refined or estimate["tgt_from_src"]), agrees
     return None
 
 
@@ -194,8 +194,8 @@ def merged(
 def _add(whole: "pycolmap.Reconstruction", other: "pycolmap.Reconstruction") -> None:
     import pycolmap
 
-    known = set(whole.reg_image_ids())
-    new = [number for number in other.reg_image_ids() if number not in known]
+    present = set(whole.reg_image_ids())
+    new = [number for number in other.reg_image_ids() if number not in present]
     cameras: dict[int, int] = {}
     for number in new:
         image = other.image(number)

@@ -112,7 +112,7 @@ class Layout:
     def is_whole(self) -> bool:
         """True if all files exist that show how a finished scene was made."""
         files, folders = (self.plan, self.features, self.links), (self.models, self.placed)
-        return all(each.is_file() for each in files) and all(each.is_dir() for each in folders)
+        return all(path.is_file() for path in files) and all(path.is_dir() for path in folders)
 
 
 def check_ours(layout: Layout, photos: Path) -> None:

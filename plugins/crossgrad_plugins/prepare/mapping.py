@@ -140,24 +140,24 @@ def _without_misplaced(
         models: The models, the largest first.
         settled: Photos of the largest model for which no better pose is known.
     """
-    found: dict[str, tuple[int, int]] = {}
+    removed: dict[str, tuple[int, int]] = {}
     for number, model in enumerate(models):
-        known = frozenset[int]() if number else settled
+        settled_here = frozenset[int]() if number else settled
         doubted = waited(
             "checking poses",
-            lambda _, model=model, known=known: contradicted(  # type: ignore[misc]
-                model, layout.database, known
+            lambda _, model=model, settled_here=settled_here: contradicted(  # type: ignore[misc]
+                model, layout.database, settled_here
             ),
             lambda: "",
         )
         for photo, votes in doubted.items():
             image = model.image(photo)
-            found[image.name] = votes
+            removed[image.name] = votes
             model.deregister_frame(image.frame_id)
     kept = [model for model in models if model.num_reg_images() >= _SMALLEST]
     elsewhere = {model.image(n).name for model in kept for n in model.reg_image_ids()}
-    told = {name: votes for name, votes in sorted(found.items()) if name not in elsewhere}
-    write_atomically(layout.misplaced, json.dumps(told, indent=1).encode())
+    unplaced = {name: votes for name, votes in sorted(removed.items()) if name not in elsewhere}
+    write_atomically(layout.misplaced, json.dumps(unplaced, indent=1).encode())
     return kept
 
 
@@ -220,23 +220,23 @@ def _looked_again(
 
 
 def _adjusted(
-    threads: int, photos: Path, token: "pycolmap.CancellationToken", database: Path, place: Path
+    threads: int, photos: Path, token: "pycolmap.CancellationToken", database: Path, folder: Path
 ) -> "pycolmap.Reconstruction":
     """Return the model in a folder after a new triangulation and continued mapping."""
     import pycolmap
 
-    anew, found = (emptied(place / name) for name in ("anew", "found"))
+    anew, mapped = (emptied(folder / name) for name in ("anew", "found"))
     options = _options(threads)
     options.multiple_models = False
     model = pycolmap.triangulate_points(
-        pycolmap.Reconstruction(place), database, photos, anew, options=options,
+        pycolmap.Reconstruction(folder), database, photos, anew, options=options,
         cancellation_token=token,
     )  # fmt: skip
     write_model(model, anew)
     models = pycolmap.incremental_mapping(
-        database, photos, found, options=options, input_path=anew, cancellation_token=token
+        database, photos, mapped, options=options, input_path=anew, cancellation_token=token
     )
-    return max(models.values(), key=lambda each: each.num_reg_images(), default=model)
+    return max(models.values(), key=lambda candidate: candidate.num_reg_images(), default=model)
 
 
 def _global(layout: Layout, plan: Plan, threads: int, out: Path) -> Models:

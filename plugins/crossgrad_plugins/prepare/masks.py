@@ -76,8 +76,8 @@ def sorted_out(root: Path, files: Sequence[str], wanted: Path | None) -> Sorted:
         photos = [name for name in photos if os.path.realpath(root / name) not in taken]
         masks = {name: masks[name] for name in photos if name in masks}
         _check_some(wanted, photos, masks)
-    told = *_tell_folders(root, folders, photos, wanted), *_strays(beside, photos)
-    return Sorted(tuple(photos), masks, told)
+    left_out = *_tell_folders(root, folders, photos, wanted), *_strays(beside, photos)
+    return Sorted(tuple(photos), masks, left_out)
 
 
 def _folders(root: Path, files: Sequence[str], wanted: Path | None) -> dict[str, list[str]]:
@@ -92,15 +92,17 @@ def _folders(root: Path, files: Sequence[str], wanted: Path | None) -> dict[str,
     def is_asked(folder: str) -> bool:
         return asked is not None and os.path.realpath(root / folder) == asked
 
-    found = defaultdict[str, list[str]](list)
+    by_folder = defaultdict[str, list[str]](list)
     for name in files:
-        above = [each.as_posix() for each in PurePosixPath(name).parents][-2::-1]
-        masks = (each for each in above if is_asked(each) or PurePosixPath(each).name == _MASKS)
-        found[next(masks, "")].append(name)
-    others = found.pop("", [])
+        above = [parent.as_posix() for parent in PurePosixPath(name).parents][-2::-1]
+        masks = (
+            parent for parent in above if is_asked(parent) or PurePosixPath(parent).name == _MASKS
+        )
+        by_folder[next(masks, "")].append(name)
+    others = by_folder.pop("", [])
     return {
         folder: inside
-        for folder, inside in found.items()
+        for folder, inside in by_folder.items()
         if folder == _MASKS
         or is_asked(folder)
         or 2 * len(_of_photos(root, folder, inside, others)) > len(inside)
@@ -124,16 +126,16 @@ def _below(folder: str, name: str) -> str | None:
 def _of_photos(root: Path, folder: str, inside: Iterable[str], photos: Sequence[str]) -> set[str]:
     """Return the files of a mask folder that are named after photos."""
     below = (_below(folder, name) for name in photos)
-    named = {f"{folder}/{each}" for name in below if name is not None for each in mask_names(name)}
+    named = {f"{folder}/{mask}" for name in below if name is not None for mask in mask_names(name)}
     named |= {path.relative_to(root).as_posix() for path in _paired(root, folder, photos).values()}
     return named.intersection(inside)
 
 
 def _paired(root: Path, folder: str, photos: Sequence[str]) -> dict[str, Path]:
     """Return photo -> mask for the masks in a folder below `root` and the photos next to it."""
-    below = {name: each for name in photos if (each := _below(folder, name)) is not None}
-    found = pair_masks(root / folder, [*below.values()])
-    return {name: found[each] for name, each in below.items() if each in found}
+    below = {name: path for name in photos if (path := _below(folder, name)) is not None}
+    pairs = pair_masks(root / folder, [*below.values()])
+    return {name: pairs[path] for name, path in below.items() if path in pairs}
 
 
 def _usual(root: Path, photos: Sequence[str], folders: Iterable[str]) -> dict[str, Path]:
@@ -141,7 +143,9 @@ def _usual(root: Path, photos: Sequence[str], folders: Iterable[str]) -> dict[st
     stems = {name: str(PurePosixPath(name).with_suffix("")) for name in photos}
     beside = {name: [root / f"{stem}{end}.png" for end in _ENDS] for name, stem in stems.items()}
     masks = _first(root, beside)
-    for folder in sorted(folders, key=lambda each: (each != _MASKS, each), reverse=True):
+    for folder in sorted(
+        folders, key=lambda mask_folder: (mask_folder != _MASKS, mask_folder), reverse=True
+    ):
         pairs = _paired(root, folder, photos)
         masks |= {name: path.absolute() for name, path in pairs.items()}
     return masks
@@ -149,24 +153,26 @@ def _usual(root: Path, photos: Sequence[str], folders: Iterable[str]) -> dict[st
 
 def _wanted(root: Path, photos: Sequence[str], folder: Path) -> dict[str, Path]:
     """Return the masks in the requested folder."""
-    masks = _first(root, {name: [folder / each for each in mask_names(name)] for name in photos})
+    masks = _first(root, {name: [folder / mask for mask in mask_names(name)] for name in photos})
     if os.path.realpath(folder) == os.path.realpath(root):
         return masks
-    own = frozenset(os.path.realpath(root / name) for name in photos)
+    photo_files = frozenset(os.path.realpath(root / name) for name in photos)
     pairs = pair_masks(folder, photos)
-    return {n: p.absolute() for n, p in pairs.items() if os.path.realpath(p) not in own} | masks
+    return {
+        n: p.absolute() for n, p in pairs.items() if os.path.realpath(p) not in photo_files
+    } | masks
 
 
 def _first(root: Path, places: Mapping[str, Iterable[Path]]) -> dict[str, Path]:
     """Return the first existing file for each photo. A photo is never its own mask."""
-    found: dict[str, Path] = {}
+    masks: dict[str, Path] = {}
     for name, paths in places.items():
-        own = os.path.realpath(root / name)
-        there = (each for each in paths if is_file(each) and os.path.realpath(each) != own)
+        photo_file = os.path.realpath(root / name)
+        there = (path for path in paths if is_file(path) and os.path.realpath(path) != photo_file)
         mask = next(there, None)
         if mask is not None:
-            found[name] = mask.absolute()
-    return found
+            masks[name] = mask.absolute()
+    return masks
 
 
 def _check_some(wanted: Path, photos: Sequence[str], masks: Mapping[str, Path]) -> None:

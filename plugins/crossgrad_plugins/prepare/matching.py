@@ -63,13 +63,13 @@ def _sample(layout: Layout) -> NDArray[np.float32]:
         database = pycolmap.Database.open(layout.database)
         try:
             numbers = [image.image_id for image in database.read_all_images()]
-            known = [number for number in numbers if database.exists_descriptors(number)]
-            each = -(-_SAMPLE // len(known))
+            described = [number for number in numbers if database.exists_descriptors(number)]
+            per_photo = -(-_SAMPLE // len(described))
             parts = []
-            for number in known:
-                found = np.asarray(database.read_descriptors(number).data)
-                rows = rng.permutation(len(found))[:each]
-                parts.append(found[rows].astype(np.float32))
+            for number in described:
+                descriptors = np.asarray(database.read_descriptors(number).data)
+                rows = rng.permutation(len(descriptors))[:per_photo]
+                parts.append(descriptors[rows].astype(np.float32))
         finally:
             database.close()
     return np.concatenate(parts)
@@ -127,8 +127,8 @@ def way_of(plan: Plan) -> str:
         return "exhaustive"
     if len(plan.located) >= _MOST_LOCATED * photos:
         return "spatial"
-    some = _SOME if len(plan.folders) == 1 else _SOME_OF_FOLDERS
-    return "exhaustive" if photos <= some else "retrieval"
+    most = _SOME if len(plan.folders) == 1 else _SOME_OF_FOLDERS
+    return "exhaustive" if photos <= most else "retrieval"
 
 
 def check_gps(plan: Plan) -> None:
@@ -156,13 +156,13 @@ def found_links(layout: Layout, plan: Plan, threads: int) -> tuple[Link, ...]:
         return tuple(Link(*row) for row in json.loads(layout.links.read_bytes()))
     way = way_of(plan)
     check_folder(layout.work, _room(layout, plan, way))
-    pairings = {each: _pairing(each, layout, way, threads) for each in _WAYS[way]}
+    pairings = {method: _pairing(method, layout, way, threads) for method in _WAYS[way]}
     total = _pairs(layout, pairings)
-    for each, pairing in pairings.items():
+    for method, pairing in pairings.items():
         waited(
             "comparing photos",
-            lambda token, each=each, pairing=pairing: _match(  # type: ignore[misc]
-                layout, each, pairing, threads, token
+            lambda token, method=method, pairing=pairing: _match(  # type: ignore[misc]
+                layout, method, pairing, threads, token
             ),
             lambda: f"{rows_of(layout.database, 'two_view_geometries')}{total} pairs ({way})",
         )
@@ -175,8 +175,10 @@ def found_links(layout: Layout, plan: Plan, threads: int) -> tuple[Link, ...]:
 def _room(layout: Layout, plan: Plan, way: str) -> int:
     """Return the bytes that missing pairs need, because SQLite aborts on a full disk."""
     photos = len(plan.used)
-    each = {"exhaustive": photos / 2, "sequential": _NEXT_ALONE}.get(way, _ALIKE + _NEXT)
-    missing = photos * min(each, photos / 2) - rows_of(layout.database, "two_view_geometries")
+    pairs_per_photo = {"exhaustive": photos / 2, "sequential": _NEXT_ALONE}.get(way, _ALIKE + _NEXT)
+    missing = photos * min(pairs_per_photo, photos / 2) - rows_of(
+        layout.database, "two_view_geometries"
+    )
     return int(max(0.0, missing) * _BYTES_OF_PAIR * plan.settings.max_features) + JOURNAL
 
 
@@ -201,22 +203,22 @@ def _match(
     )  # fmt: skip
 
 
-def _pairing(each: str, layout: Layout, way: str, threads: int) -> object:
+def _pairing(method: str, layout: Layout, way: str, threads: int) -> object:
     """Return pycolmap's options for one of its pairing methods."""
     import pycolmap
 
     options: Any
-    if each == "spatial":
+    if method == "spatial":
         options = pycolmap.SpatialPairingOptions()
         # Photos from the ground are neighbours of aerial photos above them.
         options.ignore_z = True
         options.max_num_neighbors, options.max_distance = _NEAREST, _FARTHEST
-    elif each == "vocabtree":
+    elif method == "vocabtree":
         options = pycolmap.VocabTreePairingOptions()
         options.vocab_tree_path = index_of(layout, threads)
         options.num_images, options.max_num_features = _ALIKE, _LOOKED_UP
         options.num_threads = threads
-    elif each == "sequential":
+    elif method == "sequential":
         options = pycolmap.SequentialPairingOptions()
         options.overlap = _NEXT_ALONE if way == "sequential" else _NEXT
     else:
@@ -258,9 +260,9 @@ def _read(layout: Layout) -> tuple[Link, ...]:
             pairs, counts = database.read_two_view_geometry_num_inliers()
         finally:
             database.close()
-    found = []
+    links = []
     for pair, count in zip(pairs, counts, strict=True):
-        one, other = sorted(names[each] for each in pycolmap.pair_id_to_image_pair(pair))
+        one, other = sorted(names[number] for number in pycolmap.pair_id_to_image_pair(pair))
         if count:
-            found.append(Link(one, other, int(count)))
-    return tuple(sorted(found, key=lambda link: (link.first, link.second)))
+            links.append(Link(one, other, int(count)))
+    return tuple(sorted(links, key=lambda link: (link.first, link.second)))

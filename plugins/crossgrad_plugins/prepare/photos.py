@@ -41,8 +41,8 @@ def camera_of(image: "Image") -> str:
 
 def orientation_of(image: "Image") -> int:
     """Return the EXIF orientation of the photo, 1 to 8, or 1 if it is missing."""
-    found = image.getexif().get(_ORIENTATION)
-    return found if isinstance(found, int) and found in _ORIENTATIONS else 1
+    orientation = image.getexif().get(_ORIENTATION)
+    return orientation if isinstance(orientation, int) and orientation in _ORIENTATIONS else 1
 
 
 def position_of(image: "Image") -> Position | None:
@@ -105,22 +105,23 @@ def find_photos(
     for folder in filter(None, (root.resolve(), wanted)):
         _check_text(folder)
     files = [name for name in _names(root) if PurePosixPath(name).suffix.lower() in _KNOWN]
-    told = sorted_out(root, files, wanted)
-    names, left_out = _listed(told.photos)
-    left_out += told.left_out
+    sorted_files = sorted_out(root, files, wanted)
+    names, left_out = _listed(sorted_files.photos)
+    left_out += sorted_files.left_out
     used: list[Photo] = []
     with ThreadPoolExecutor(_AT_ONCE) as pool:
         looks = pool.map(
-            lambda name: _looked_at(root, name, told.masks.get(name), settings.cameras), names
+            lambda name: _looked_at(root, name, sorted_files.masks.get(name), settings.cameras),
+            names,
         )
-        for done, found in enumerate(looks, 1):
-            (used if isinstance(found, Photo) else left_out).append(found)  # type: ignore[arg-type]
+        for done, inspected in enumerate(looks, 1):
+            (used if isinstance(inspected, Photo) else left_out).append(inspected)  # type: ignore[arg-type]
             tell(done, len(names))
     used, doubles = _without_doubles(used)
     left_out += doubles
     if len(used) < fewest:
         raise _too_few(root, used, left_out)
-    return tuple(used), tuple(sorted(left_out, key=lambda each: each.name))
+    return tuple(used), tuple(sorted(left_out, key=lambda unusable: unusable.name))
 
 
 def has_photos(root: Path) -> bool:
@@ -280,12 +281,12 @@ def _most_pixels(header: PhotoHeader) -> int:
 
 
 def _too_large(path: Path, header: PhotoHeader) -> UserError:
-    usual, most = megapixels(pillow.MOST_PIXELS), megapixels(_REDUCIBLE * pillow.MOST_PIXELS)
+    limit, most = megapixels(pillow.MOST_PIXELS), megapixels(_REDUCIBLE * pillow.MOST_PIXELS)
     pixels = megapixels(header.width * header.height)
     return UserError(
         "the photo is too large to be decoded",
         where=path,
-        expected=f"at most {usual}, or {most} for a JPEG file that is not progressive",
+        expected=f"at most {limit}, or {most} for a JPEG file that is not progressive",
         found=f"{header.width} x {header.height} pixels, {pixels}",
         todo="save it at a smaller size, such as half its width and height, or remove it "
         "from the folder (--max-size applies only after decoding)",
@@ -308,7 +309,7 @@ def _without_doubles(photos: Sequence[Photo]) -> tuple[list[Photo], list[LeftOut
 
 def _too_few(root: Path, used: Sequence[Photo], left_out: Sequence[LeftOut]) -> UserError:
     """Return the error for too few usable photos."""
-    first = "; ".join(f"{each.name}: {each.why}" for each in left_out[:3])
+    first = "; ".join(f"{unusable.name}: {unusable.why}" for unusable in left_out[:3])
     nothing = not used and not left_out
     todo = "name the folder that contains the photos"
     if left_out:

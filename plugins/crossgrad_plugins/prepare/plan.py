@@ -131,19 +131,19 @@ def agreed(layout: Layout, plan: Plan) -> Plan:
     Raises:
         UserError: The scene was begun with other photos or settings, or its plan is damaged.
     """
-    known = read_plan(layout) if layout.plan.is_file() else None
-    if known is not None:
-        _check_same(layout, known, plan)
-    if known is not None and layout.is_ready:
-        return known
-    if known != plan:
+    earlier = read_plan(layout) if layout.plan.is_file() else None
+    if earlier is not None:
+        _check_same(layout, earlier, plan)
+    if earlier is not None and layout.is_ready:
+        return earlier
+    if earlier != plan:
         layout.work.mkdir(parents=True, exist_ok=True)
         write_atomically(layout.plan, plan.model_dump_json(indent=1).encode())
     return plan
 
 
-def _check_same(layout: Layout, known: Plan, plan: Plan) -> None:
-    differs = _difference(known, plan, some=layout.is_ready)
+def _check_same(layout: Layout, earlier: Plan, plan: Plan) -> None:
+    differs = _difference(earlier, plan, may_lack_photos=layout.is_ready)
     if differs:
         raise UserError(
             "the scene folder was begun with other photos or settings",
@@ -181,28 +181,30 @@ def read_plan(layout: Layout) -> Plan:
     return plan
 
 
-def _difference(known: Plan, plan: Plan, *, some: bool) -> str:
+def _difference(earlier: Plan, plan: Plan, *, may_lack_photos: bool) -> str:
     """Describe the differences between two plans. Return an empty text for equal plans.
 
     Args:
-        known: The plan of the scene.
+        earlier: The plan of the scene.
         plan: The new plan.
-        some: True if photos of the old plan may be missing from the new plan.
+        may_lack_photos: True if photos of the old plan may be missing from the new plan.
     """
-    was, now = known.settings.model_dump(), plan.settings.model_dump()
+    was, now = earlier.settings.model_dump(), plan.settings.model_dump()
     # Compare only the content of masks, not their folder.
-    told = [f"{key} was {was[key]}, now {now[key]}" for key in was
+    changes = [f"{key} was {was[key]}, now {now[key]}" for key in was
             if was[key] != now[key] and key != "masks"]  # fmt: skip
     after = {photo.name: photo for photo in plan.used}
-    before = {photo.name: photo for photo in known.used if photo.name in after or not some}
-    sums = [{photo.name: photo.sha256 for photo in each.values()} for each in (before, after)]
-    told += _changes("photo", *sums)
+    before = {
+        photo.name: photo for photo in earlier.used if photo.name in after or not may_lack_photos
+    }
+    sums = [{photo.name: photo.sha256 for photo in photos.values()} for photos in (before, after)]
+    changes += _changes("photo", *sums)
     both = [(before[name], after[name]) for name in before.keys() & after.keys()]
     new = {photo.name: photo.mask_sha256 for _, photo in both if photo.mask}
     # Older plans contain no mask digests.
-    old = {each.name: each.mask_sha256 or photo.mask_sha256 for each, photo in both
-           if each.mask and (photo.mask or not some)}  # fmt: skip
-    return "; ".join([*told, *_changes("mask", old, new)])
+    old = {old_photo.name: old_photo.mask_sha256 or photo.mask_sha256 for old_photo, photo in both
+           if old_photo.mask and (photo.mask or not may_lack_photos)}  # fmt: skip
+    return "; ".join([*changes, *_changes("mask", old, new)])
 
 
 def _changes(

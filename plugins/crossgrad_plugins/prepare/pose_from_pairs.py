@@ -87,12 +87,12 @@ class PairView:
             np.asarray(rays, dtype=np.float64) * focal
             for rays, focal in zip(self.rays, self.focals, strict=True)
         ]
-        found = pycolmap.estimate_calibrated_two_view_geometry(
+        geometry = pycolmap.estimate_calibrated_two_view_geometry(
             cameras[0], points[0], cameras[1], points[1],
             np.repeat(np.arange(len(points[0]), dtype=np.uint32)[:, None], 2, axis=1), options,
         )  # fmt: skip
-        enough = len(np.asarray(found.inlier_matches)) >= _MATCHES
-        return found.cam2_from_cam1 if enough else None
+        enough = len(np.asarray(geometry.inlier_matches)) >= _MATCHES
+        return geometry.cam2_from_cam1 if enough else None
 
 
 class Pairs:
@@ -115,22 +115,22 @@ class Pairs:
         for pair, count in zip(pairs, counts, strict=True):
             if count >= _MATCHES:
                 one, two = pycolmap.pair_id_to_image_pair(pair)
-                found = np.asarray(database.read_two_view_geometry(one, two).inlier_matches)
-                self.matches[one, two] = found.astype(np.int64)
+                inliers = np.asarray(database.read_two_view_geometry(one, two).inlier_matches)
+                self.matches[one, two] = inliers.astype(np.int64)
                 self.partners.setdefault(one, []).append(two)
                 self.partners.setdefault(two, []).append(one)
 
     def sights(self, photo: int, poses: "Mapping[int, pycolmap.Rigid3d]") -> list[PairView]:
         """Return the pairs of a photo with photos that have poses, most matches first."""
-        found = []
+        sights = []
         for other in self.partners.get(photo, ()):
             if other in poses:
                 stored = self.matches.get((other, photo))
                 rows = self.matches[photo, other][:, ::-1] if stored is None else stored
                 rays = self.rays.of(other)[rows[:, 0]], self.rays.of(photo)[rows[:, 1]]
                 focals = self.rays.focal(other), self.rays.focal(photo)
-                found.append(PairView(other, poses[other], focals, rays, rows[:, 0]))
-        return sorted(found, key=lambda sight: (-len(sight.features), sight.other))
+                sights.append(PairView(other, poses[other], focals, rays, rows[:, 0]))
+        return sorted(sights, key=lambda sight: (-len(sight.features), sight.other))
 
     def without(self, aside: Collection[tuple[int, int]]) -> frozenset[int]:
         """Return the photos for which `aside` contains all pairs of the photo."""
@@ -242,8 +242,8 @@ def _distances(
     rows = [row for row, at in enumerate(sight.features) if points[int(at)].has_point3D()]
     if not rows:
         return np.zeros(0)
-    places = [model.point3D(points[int(sight.features[row])].point3D_id).xyz for row in rows]
-    offsets = np.stack(places) - sight.pose.inverse().translation
+    positions = [model.point3D(points[int(sight.features[row])].point3D_id).xyz for row in rows]
+    offsets = np.stack(positions) - sight.pose.inverse().translation
     rays = np.column_stack([sight.rays[1][rows], np.ones(len(rows))]) @ rotation
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     # Perpendicular to the ray to a point, offset and direction are parallel.
@@ -251,9 +251,9 @@ def _distances(
     beside = offsets - rays * (rays * offsets).sum(axis=1, keepdims=True)
     square = (across**2).sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        found = (across * beside).sum(axis=1) / square
-    ahead = ((offsets - found[:, None] * direction) * rays).sum(axis=1) > 0.0
-    return np.asarray(found[(square > 1.0 - _SAME_DIRECTION**2) & (found > 0.0) & ahead])
+        distances = (across * beside).sum(axis=1) / square
+    ahead = ((offsets - distances[:, None] * direction) * rays).sum(axis=1) > 0.0
+    return np.asarray(distances[(square > 1.0 - _SAME_DIRECTION**2) & (distances > 0.0) & ahead])
 
 
 class Rays:

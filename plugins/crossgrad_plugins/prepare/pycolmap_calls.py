@@ -80,8 +80,8 @@ def waited(
                     return future.result(timeout=_LOOK)
                 except TimeoutError:
                     if progress.due:
-                        told = ", ".join(filter(None, [far(), f"{monotonic() - begun:.0f} s"]))
-                        progress.tell(f"{what}: {told}")
+                        text = ", ".join(filter(None, [far(), f"{monotonic() - begun:.0f} s"]))
+                        progress.tell(f"{what}: {text}")
         except (RuntimeError, ValueError, IndexError) as error:
             raise UserError(
                 f"pycolmap failed in the stage {what}",

@@ -94,11 +94,11 @@ def looked_again(
         changed = pycolmap.Reconstruction(main)
         again.move(changed, look)
         moved |= look.better.keys()
-        place = scratch / str(number)
-        place.mkdir()
-        write_model(changed, place)
+        folder = scratch / str(number)
+        folder.mkdir()
+        write_model(changed, folder)
         try:
-            main = adjust(again.copy, place)
+            main = adjust(again.copy, folder)
         except (RuntimeError, ValueError) as error:
             _LOG.warning("doubtful photos keep their poses: pycolmap failed: %s", error)
             break
@@ -166,8 +166,8 @@ class _Again:
                 continue
             there = elsewhere.get(photo, Support())
             now = here if photo in poses else there
-            found, pose = best_place(model, sights)
-            if pose is not None and found.enough and found.matches >= _BETTER * now.matches:
+            evidence, pose = best_place(model, sights)
+            if pose is not None and evidence.enough and evidence.matches >= _BETTER * now.matches:
                 better[photo] = pose
             elif photo in poses and here.enough and there <= here:
                 settled.add(photo)
@@ -175,12 +175,12 @@ class _Again:
 
     def _elsewhere(self, database: "pycolmap.Database") -> dict[int, Support]:
         """Return the evidence for poses in the other models, and the cameras of these models."""
-        found = {}
+        evidence = {}
         for model in self._others:
             pairs, poses = Pairs(_cameras_of(model), database), poses_of(model)
             for photo, pose in poses.items():
-                found[photo] = support(pairs.sights(photo, poses), pose)
-        return found
+                evidence[photo] = support(pairs.sights(photo, poses), pose)
+        return evidence
 
     def move(self, model: "pycolmap.Reconstruction", look: Look) -> None:
         """Place photos, disable pairs that contradict the poses, and enable the other pairs.
@@ -239,23 +239,23 @@ def _best_known(models: Models, database: "pycolmap.Database") -> "dict[int, pyc
     same guess for other cameras; the median of these refinements is applied. With a wrong focal
     length, poses have large errors, and bundle adjustment does not always correct them.
     """
-    known: dict[int, pycolmap.Camera] = {}
+    cameras: dict[int, pycolmap.Camera] = {}
     for model in models:
-        known = {**_cameras_of(model), **known}
+        cameras = {**_cameras_of(model), **cameras}
     guessed = [
         camera for camera in database.read_all_cameras() if not camera.has_prior_focal_length
     ]
     ratios = [
-        known[camera.camera_id].mean_focal_length() / camera.mean_focal_length()
+        cameras[camera.camera_id].mean_focal_length() / camera.mean_focal_length()
         for camera in guessed
-        if camera.camera_id in known
+        if camera.camera_id in cameras
     ]
     for camera in guessed:
-        if ratios and camera.camera_id not in known:
-            for place in camera.focal_length_idxs():
-                camera.params[place] *= float(np.median(ratios))
-            known[camera.camera_id] = camera
-    return known
+        if ratios and camera.camera_id not in cameras:
+            for index in camera.focal_length_idxs():
+                camera.params[index] *= float(np.median(ratios))
+            cameras[camera.camera_id] = camera
+    return cameras
 
 
 def _leave_out_impossible(model: "pycolmap.Reconstruction") -> None:
@@ -278,19 +278,23 @@ def _place(
 
     image = database.read_image(photo)
     number = image.frame_id
-    known = cameras.get(image.camera_id)
-    if known and model.exists_camera(image.camera_id) and image.camera_id not in _cameras_of(model):
-        model.camera(image.camera_id).params = list(known.params)
+    camera = cameras.get(image.camera_id)
+    if (
+        camera
+        and model.exists_camera(image.camera_id)
+        and image.camera_id not in _cameras_of(model)
+    ):
+        model.camera(image.camera_id).params = list(camera.params)
     if photo not in model.images:
         frame = database.read_frame(number)
         if not model.exists_camera(image.camera_id):
-            model.add_camera(known or database.read_camera(image.camera_id))
+            model.add_camera(camera or database.read_camera(image.camera_id))
         if not model.exists_rig(frame.rig_id):
             model.add_rig(database.read_rig(frame.rig_id))
         if not model.exists_frame(number):
             model.add_frame(frame)
         points = np.asarray(database.read_keypoints(photo)[:, :2], dtype=np.float64)
-        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(each) for each in points])
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(point) for point in points])
         model.add_image(image)
     frame = model.frame(number)
     if frame.has_pose():

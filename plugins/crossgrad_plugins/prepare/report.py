@@ -81,7 +81,7 @@ class Report:
 def data_of(report: Report) -> dict[str, Any]:
     """Return the report as data."""
     plan, posed = report.plan, report.posed
-    found = report.result.figures
+    figures = report.result.figures
     parts = [
         {"photos": len(part.photos), "points": part.points, "reprojection_error_px": part.error,
          "in_the_scene": part.joined, "not_on_earth_because": part.unplaced}
@@ -96,13 +96,13 @@ def data_of(report: Report) -> dict[str, Any]:
         "mapper": report.ways[1],
         "used": len(plan.used),
         "registered": len(posed),
-        "left_out": [each.model_dump() for each in plan.left_out],
-        "unregistered": [asdict(each) for each in report.lost],
-        "model": found,
+        "left_out": [photo.model_dump() for photo in plan.left_out],
+        "unregistered": [asdict(photo) for photo in report.lost],
+        "model": figures,
         "models": parts,
         "folders": [_folder(report, name) for name in plan.folders],
-        "joins": [asdict(each) for each in report.joins],
-        "bridges": [asdict(each) for each in report.bridges],
+        "joins": [asdict(join) for join in report.joins],
+        "bridges": [asdict(bridge) for bridge in report.bridges],
         "gps": None if report.result.georef is None else report.result.georef["residuals_m"],
         "gps_photos": len(plan.located),
         "masked_photos": sum(photo.mask is not None for photo in plan.used),
@@ -112,12 +112,12 @@ def data_of(report: Report) -> dict[str, Any]:
 
 def _folder(report: Report, name: str) -> dict[str, Any]:
     photos = [photo.name for photo in report.plan.used if photo.folder == name]
-    heights = [report.heights[each] for each in photos if each in report.heights]
+    heights = [report.heights[photo_name] for photo_name in photos if photo_name in report.heights]
     return {
         "folder": name,
         "photos": len(photos),
-        "registered": sum(each in report.posed for each in photos),
-        "features": median(report.features[each] for each in photos),
+        "registered": sum(photo_name in report.posed for photo_name in photos),
+        "features": median(report.features[photo_name] for photo_name in photos),
         "height_m": median(heights) if heights else None,
     }
 
@@ -157,11 +157,12 @@ def _masks(plan: Plan) -> Iterator[str]:
 def _gps(report: Report) -> Iterator[str]:
     georef, located = report.result.georef, len(report.plan.located)
     if georef is not None:
-        found = georef["residuals_m"]
+        residuals = georef["residuals_m"]
         yield (
-            f"GPS: {found['photos']} photos, {found['agreeing']} agree; residuals "
-            f"{found['rms_horizontal']:.2f} m horizontally and {found['rms_vertical']:.2f} m "
-            f"vertically (root mean square), at most {found['max']:.2f} m"
+            f"GPS: {residuals['photos']} photos, {residuals['agreeing']} agree; residuals "
+            f"{residuals['rms_horizontal']:.2f} m horizontally and "
+            f"{residuals['rms_vertical']:.2f} m vertically (root mean square), at most "
+            f"{residuals['max']:.2f} m"
         )
     elif located:
         yield f"GPS: {located} photos have it, but {report.result.parts[0].unplaced}"
@@ -186,7 +187,7 @@ def _missing(report: Report, most: int) -> Iterator[str]:
         yield f"not joined to the scene: {len(others)} other models with {sizes} photos"
     for bridge in report.bridges:
         yield f"models are not connected ({bridge.pairs} pairs match across): {bridge.advice}"
-    yield from _some([f"no pose: {each.name}: {each.why}" for each in report.lost], most)
+    yield from _some([f"no pose: {photo.name}: {photo.why}" for photo in report.lost], most)
     yield from _some([f"left out: {e.name}: {e.why}" for e in report.plan.left_out], most)
 
 

@@ -69,27 +69,35 @@ def placed(layout: Layout, plan: Plan, models: "Sequence[pycolmap.Reconstruction
     """
     if not layout.placed.is_dir():
         _place(layout, plan, models)
-    found = json.loads((layout.placed / _FILE).read_bytes())
-    return Result(tuple(Part(**part) for part in found["parts"]), found["georef"], found["figures"])
+    content = json.loads((layout.placed / _FILE).read_bytes())
+    return Result(
+        tuple(Part(**part) for part in content["parts"]), content["georef"], content["figures"]
+    )
 
 
 def _place(layout: Layout, plan: Plan, models: "Sequence[pycolmap.Reconstruction]") -> None:
     positions = local_positions(plan)
     tops = {photo.name: top_of(photo.orientation) for photo in plan.used}
-    found = [placement_of(model, positions, tops) for model in models]
-    for model, (placement, _) in zip(models, found, strict=True):
+    outcomes = [placement_of(model, positions, tops) for model in models]
+    for model, (placement, _) in zip(models, outcomes, strict=True):
         if placement is not None:
             model.transform(placement.similarity)
-    on_earth = found[0][0] is not None
-    joined = [i == 0 or (on_earth and each is not None) for i, (each, _) in enumerate(found)]
+    on_earth = outcomes[0][0] is not None
+    joined = [
+        i == 0 or (on_earth and placement is not None) for i, (placement, _) in enumerate(outcomes)
+    ]
     others = [model for model, inside in zip(models[1:], joined[1:], strict=True) if inside]
     whole = merged(models[0], others) if others else models[0]
     whole.update_point_3d_errors()
     parts = [
         _part(model, placement, why, inside)
-        for model, (placement, why), inside in zip(models, found, joined, strict=True)
+        for model, (placement, why), inside in zip(models, outcomes, joined, strict=True)
     ]
-    placements = [each for (each, _), inside in zip(found, joined, strict=True) if inside and each]
+    placements = [
+        placement
+        for (placement, _), inside in zip(outcomes, joined, strict=True)
+        if inside and placement
+    ]
     result = {
         "parts": [vars(part) for part in parts],
         "georef": _georef(plan, placements) if on_earth else None,
@@ -133,11 +141,13 @@ def _georef(plan: Plan, placements: Sequence[Placement]) -> dict[str, Any]:
     """Return the scene's place on Earth: metres east, north and up of the origin."""
     origin = origin_of(plan)
     assert origin is not None
-    residuals = {name: each for found in placements for name, each in found.residuals.items()}
-    lengths = np.array([np.linalg.norm(each) for each in residuals.values()])
-    level = np.array([np.linalg.norm(each[:2]) for each in residuals.values()])
-    height = np.array([abs(each[2]) for each in residuals.values()])
-    agreeing = frozenset[str]().union(*(found.agreeing for found in placements))
+    residuals = {
+        name: residual for placement in placements for name, residual in placement.residuals.items()
+    }
+    lengths = np.array([np.linalg.norm(residual) for residual in residuals.values()])
+    level = np.array([np.linalg.norm(residual[:2]) for residual in residuals.values()])
+    height = np.array([abs(residual[2]) for residual in residuals.values()])
+    agreeing = frozenset[str]().union(*(placement.agreeing for placement in placements))
     return {
         "origin": origin.model_dump(),
         "transform": np.eye(4).tolist(),
@@ -150,7 +160,7 @@ def _georef(plan: Plan, placements: Sequence[Placement]) -> dict[str, Any]:
             "max": float(lengths.max()),
             "rms_horizontal": float(np.sqrt(np.mean(level**2))),
             "rms_vertical": float(np.sqrt(np.mean(height**2))),
-            "per_photo": {name: [round(float(v), 3) for v in each]
-                          for name, each in sorted(residuals.items())},
+            "per_photo": {name: [round(float(v), 3) for v in residual]
+                          for name, residual in sorted(residuals.items())},
         },
     }  # fmt: skip

@@ -130,8 +130,8 @@ def _write_masks(layout: Layout, plan: Plan, model: "pycolmap.Reconstruction") -
     photos = {photo.name: photo for photo in plan.used}
     for number in model.reg_image_ids():
         image = model.image(number)
-        place = layout.masks / f"{image.name}.png"
-        if place.is_file():
+        path = layout.masks / f"{image.name}.png"
+        if path.is_file():
             continue
         counting = counting_pixels(Path(plan.photos), photos[image.name])
         if counting is None:
@@ -144,6 +144,6 @@ def _write_masks(layout: Layout, plan: Plan, model: "pycolmap.Reconstruction") -
         kept = np.where(bitmap.to_array() >= HALF, 255, 0).astype(np.uint8)
         content = io.BytesIO()
         Image.fromarray(kept).save(content, format="PNG")
-        with disk_errors(place):
-            place.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(place, content.getvalue())
+        with disk_errors(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, content.getvalue())

@@ -137,22 +137,22 @@ class Sweep:
 
     def tell(self) -> int:
         """Print the state of each run, and the table of finished runs."""
-        found = self.standings(alive=writer_of(self.layout.out) is not None)
-        _say(listing(self.plan.cells, found))
-        _say(["", *table(self.plan.cells, found, self.plan.grid.metric)])
+        states = self.standings(alive=writer_of(self.layout.out) is not None)
+        _say(listing(self.plan.cells, states))
+        _say(["", *table(self.plan.cells, states, self.plan.grid.metric)])
         return 0
 
     def foretell(self) -> int:
         """Print the runs that would be started, and the estimated time of these runs."""
-        found = self.standings(alive=writer_of(self.layout.out) is not None)
-        left = [each for each in found if each.state != "finished"]
-        ids = {each.job.id for each in left}
-        _say(listing([cell for cell in self.plan.cells if cell.id in ids], found))
+        states = self.standings(alive=writer_of(self.layout.out) is not None)
+        left = [standing for standing in states if standing.state != "finished"]
+        ids = {standing.job.id for standing in left}
+        _say(listing([cell for cell in self.plan.cells if cell.id in ids], states))
         _say([self._forecast(left)])
         if self.request.engine == "slurm":
             from crossgrad_plugins.sweep.engines.slurm import script
 
-            _say(["", *script(self._work(found)).splitlines()])
+            _say(["", *script(self._work(states)).splitlines()])
         return 0
 
     def write_best(self, path: Path) -> int:
@@ -168,8 +168,8 @@ class Sweep:
                 where=path,
                 todo="choose another name, or remove the file",
             )
-        found = self.standings(alive=writer_of(self.layout.out) is not None)
-        content, notes = best_grid(self.plan.grid, self.plan.cells, found, path.parent)
+        states = self.standings(alive=writer_of(self.layout.out) is not None)
+        content, notes = best_grid(self.plan.grid, self.plan.cells, states, path.parent)
         write_mapping(path, content)
         _say([*notes, f"the grid with the best parameters is in {path}"])
         return 0
@@ -192,12 +192,12 @@ class Sweep:
                     "the file system does not support locks: nothing prevents a second sweep in "
                     "the folder"
                 )
-            for place in (self.layout.out, self.layout.out / "settings"):
-                clear_half_written(place)
+            for folder in (self.layout.out, self.layout.out / "settings"):
+                clear_half_written(folder)
             write_plan(self.layout, self.plan.cells)
-            found = self.standings(alive=False)
-            _note(self._forecast([each for each in found if each.state != "finished"]))
-            signals = self._watched(found)
+            states = self.standings(alive=False)
+            _note(self._forecast([standing for standing in states if standing.state != "finished"]))
+            signals = self._watched(states)
         return self._result(signals)
 
     def _watched(self, before: Sequence[Standing]) -> list[int]:
@@ -214,7 +214,7 @@ class Sweep:
         """Return the arguments of the engine."""
         request = self.request
         return Work(
-            jobs=[each.job for each in before if each.state != "finished"],
+            jobs=[standing.job for standing in before if standing.state != "finished"],
             out=self.layout.out,
             folder=request.path.resolve().parent,
             threads=request.threads,
@@ -226,13 +226,16 @@ class Sweep:
 
     def _result(self, signals: Sequence[int]) -> int:
         """Print the results and the failed runs; return the exit code."""
-        found = self.standings(alive=False)
-        _say(table(self.plan.cells, found, self.plan.grid.metric))
-        failed = [each for each in found if each.state == "failed"]
-        left = [each for each in found if each.state not in {"finished", "failed"}]
-        done = len(found) - len(failed) - len(left)
-        _say([f"{done} of {count(len(found), 'run')} finished, results in {self.layout.out}"])
-        _say(f"failed: {each.job.title} ({each.job.id}): {each.error}" for each in failed)
+        states = self.standings(alive=False)
+        _say(table(self.plan.cells, states, self.plan.grid.metric))
+        failed = [standing for standing in states if standing.state == "failed"]
+        left = [standing for standing in states if standing.state not in {"finished", "failed"}]
+        done = len(states) - len(failed) - len(left)
+        _say([f"{done} of {count(len(states), 'run')} finished, results in {self.layout.out}"])
+        _say(
+            f"failed: {standing.job.title} ({standing.job.id}): {standing.error}"
+            for standing in failed
+        )
         if left:
             are, them = ("is", "it") if len(left) == 1 else ("are", "them")
             runs = f"{count(len(left), 'run')} {are} left"
@@ -246,7 +249,9 @@ class Sweep:
 
     def _forecast(self, left: Sequence[Standing]) -> str:
         jobs = {job.id: job for job in self.plan.jobs}
-        time = estimated([each.job for each in left], jobs, read_records(self.layout.records))
+        time = estimated(
+            [standing.job for standing in left], jobs, read_records(self.layout.records)
+        )
         return (
             f"{count(len(jobs), 'run')}, {len(jobs) - len(left)} finished, {len(left)} to do, "
             f"{self.at_a_time} at a time: {time.text(self.at_a_time)}"

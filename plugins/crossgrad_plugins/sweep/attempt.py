@@ -230,9 +230,9 @@ class Attempt:
 def _signal(code: int) -> str:
     """Return the name of the signal that ended a process; empty without a signal."""
     number = -code if code < 0 else code - 128
-    known = {each.value: each.name for each in signal.Signals}
-    killed = " (by hand, or because memory was full)" if known.get(number) == "SIGKILL" else ""
-    return f"{known[number]}{killed}" if number in known else ""
+    names = {member.value: member.name for member in signal.Signals}
+    killed = " (by hand, or because memory was full)" if names.get(number) == "SIGKILL" else ""
+    return f"{names[number]}{killed}" if number in names else ""
 
 
 class Retries:

@@ -52,29 +52,29 @@ def best_grid(
     notes: list[str] = []
     arms: list[dict[str, Any]] = []
     for arm in grid.arms:
-        own = [choice for choice in choices(grid) if choice.arm.name == arm.name]
-        if len(own) == 1:
+        arm_choices = [choice for choice in choices(grid) if choice.arm.name == arm.name]
+        if len(arm_choices) == 1:
             # Nothing varies in this arm, so it is the reference for the other arms.
             for scene in map(scene_name, grid.scenes):
-                _check_ended([(own[0], ends[own[0].label, scene])], scene, grid)
+                _check_ended([(arm_choices[0], ends[arm_choices[0].label, scene])], scene, grid)
             # Write them as parameters, because parameters can override settings and settings
             # cannot.
-            fixed = {name: {"values": [value]} for name, value in own[0].parameters.items()}
+            fixed = {name: {"values": [value]} for name, value in arm_choices[0].parameters.items()}
             as_it_is = {"name": arm.name, "settings": arm.settings, "by_scene": arm.by_scene}
             arms.append({**as_it_is, **({"parameters": fixed} if fixed else {})})
             continue
         best = {}
-        for place in grid.scenes:
-            scene = scene_name(place)
-            chosen, without = _best(own, scene, ends, grid)
-            best[scene] = _with_parameters(chosen, grid.base, place)
-            notes += [*without, *_at_the_end(chosen, scene, own)]
+        for scene_folder in grid.scenes:
+            scene = scene_name(scene_folder)
+            chosen, without = _best(arm_choices, scene, ends, grid)
+            best[scene] = _with_parameters(chosen, grid.base, scene_folder)
+            notes += [*without, *_at_the_end(chosen, scene, arm_choices)]
         arms += _twice(arm, best)
     content = {
         **({} if grid.name is None else {"name": f"{grid.name}-best"}),
         "description": grid.description,
         "base": grid.base,
-        "scenes": [each and os.path.relpath(each, folder.resolve()) for each in grid.scenes],
+        "scenes": [path and os.path.relpath(path, folder.resolve()) for path in grid.scenes],
         "seeds": list(range(first, first + SEEDS)),
         "arms": arms,
         "metric": grid.metric.model_dump(),
@@ -84,9 +84,9 @@ def best_grid(
 
 def _twice(arm: Arm, best: Mapping[str, dict[str, Any]]) -> Iterator[dict[str, Any]]:
     """Yield the arm unchanged, and the arm with its best parameters by scene."""
-    own = {"settings": arm.settings}
-    yield {"name": arm.name, **own, "by_scene": arm.by_scene}
-    yield {"name": f"{arm.name}, best", **own, "by_scene": best}
+    shared = {"settings": arm.settings}
+    yield {"name": arm.name, **shared, "by_scene": arm.by_scene}
+    yield {"name": f"{arm.name}, best", **shared, "by_scene": best}
 
 
 def _with_parameters(chosen: Choice, base: Settings, scene: str | None) -> dict[str, Any]:
@@ -104,75 +104,77 @@ def _with_parameters(chosen: Choice, base: Settings, scene: str | None) -> dict[
     return {key: value for key, value in wanted.items() if key != "scene"}
 
 
-def _below(values: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+def _below(values: Mapping[str, Any], overriding: Mapping[str, Any]) -> dict[str, Any]:
     """Merge values with the settings that override them, in one layer.
 
     If a setting chooses another component, the options of the replaced component are dropped. A run
     has one length, so if a setting sets the length, a length among the values is dropped, too.
     """
-    lengths = LENGTHS if LENGTHS & own.keys() else frozenset()
-    components = {name.removesuffix(".name") for name in own if name.endswith(".name")}
-    components |= {name for name in own if "." not in name}
+    lengths = LENGTHS if LENGTHS & overriding.keys() else frozenset()
+    components = {name.removesuffix(".name") for name in overriding if name.endswith(".name")}
+    components |= {name for name in overriding if "." not in name}
     kept = {
         name: value
         for name, value in values.items()
         if name not in lengths and name.partition(".")[0] not in components
     }
-    return {**kept, **own}
+    return {**kept, **overriding}
 
 
 def _ends(grid: Grid, cells: Iterable[Job], standings: Iterable[Standing]) -> Ends:
     """Return the metric of the runs that have ended."""
-    known = {each.job.id: each for each in standings}
-    found: dict[tuple[str, str], dict[int, float | None]] = {}
+    by_id = {standing.job.id: standing for standing in standings}
+    ends: dict[tuple[str, str], dict[int, float | None]] = {}
     for job in cells:
-        own = found.setdefault((job.label, job.scene), {})
-        if known[job.id].state in {"finished", "failed"}:
-            own[job.seed] = figure(known[job.id], grid.metric.name)
-    return found
+        by_seed = ends.setdefault((job.label, job.scene), {})
+        if by_id[job.id].state in {"finished", "failed"}:
+            by_seed[job.seed] = figure(by_id[job.id], grid.metric.name)
+    return ends
 
 
-def _best(own: Sequence[Choice], scene: str, ends: Ends, grid: Grid) -> tuple[Choice, list[str]]:
+def _best(
+    arm_choices: Sequence[Choice], scene: str, ends: Ends, grid: Grid
+) -> tuple[Choice, list[str]]:
     """Return the best of an arm's choices on a scene, and notes on excluded choices.
 
     All choices are compared on the same seeds, so a choice with a failed run is excluded.
     """
-    found = [(choice, ends[choice.label, scene]) for choice in own]
-    _check_ended(found, scene, grid)
+    results = [(choice, ends[choice.label, scene]) for choice in arm_choices]
+    _check_ended(results, scene, grid)
     sign = 1.0 if grid.metric.goal == "maximize" else -1.0
     notes: list[str] = []
     candidates: list[tuple[float, Choice]] = []
-    for choice, by_seed in found:
+    for choice, by_seed in results:
         values = [value for value in by_seed.values() if value is not None]
         if len(values) == len(by_seed):
             candidates.append((sign * mean(values), choice))
         else:
             notes.append(_no_candidate(choice, scene, by_seed, grid))
     if not candidates:
-        raise _nothing_to_choose(own, scene, grid)
-    return max(candidates, key=lambda each: each[0])[1], notes
+        raise _nothing_to_choose(arm_choices, scene, grid)
+    return max(candidates, key=lambda candidate: candidate[0])[1], notes
 
 
-def _nothing_to_choose(own: Sequence[Choice], scene: str, grid: Grid) -> UserError:
+def _nothing_to_choose(arm_choices: Sequence[Choice], scene: str, grid: Grid) -> UserError:
     return UserError(
         "the best parameters cannot be chosen",
-        where=f"{scene}, arm {own[0].arm.name}",
+        where=f"{scene}, arm {arm_choices[0].arm.name}",
         expected=f"a value whose runs all finished and have {grid.metric.name}",
-        found=f"each of the {len(own)} values has a run that failed or has no such metric",
+        found=f"each of the {len(arm_choices)} values has a run that failed or has no such metric",
         todo="look for the reasons with --list; change the values, or the name of the metric",
     )
 
 
 def _check_ended(
-    found: Sequence[tuple[Choice, Mapping[int, float | None]]], scene: str, grid: Grid
+    results: Sequence[tuple[Choice, Mapping[int, float | None]]], scene: str, grid: Grid
 ) -> None:
-    ended = sum(len(by_seed) == len(set(grid.seeds)) for _, by_seed in found)
-    if ended < len(found):
+    ended = sum(len(by_seed) == len(set(grid.seeds)) for _, by_seed in results)
+    if ended < len(results):
         raise UserError(
             "the best parameters cannot be chosen before all runs have finished",
-            where=f"{scene}, arm {found[0][0].arm.name}",
+            where=f"{scene}, arm {results[0][0].arm.name}",
             expected="a finished run for each value and seed",
-            found=f"{ended} of {len(found)} values finished",
+            found=f"{ended} of {len(results)} values finished",
             todo="finish the sweep first: run the same command without --best",
         )
 
@@ -187,10 +189,10 @@ def _no_candidate(
     )
 
 
-def _at_the_end(best: Choice, scene: str, own: list[Choice]) -> Iterator[str]:
+def _at_the_end(best: Choice, scene: str, arm_choices: list[Choice]) -> Iterator[str]:
     for name, value in best.parameters.items():
-        values = [each.parameters[name] for each in own]
-        numbers = [each for each in values if isinstance(each, int | float)]
+        values = [choice.parameters[name] for choice in arm_choices]
+        numbers = [number for number in values if isinstance(number, int | float)]
         if (
             len(numbers) == len(values)
             and value in {min(numbers), max(numbers)}

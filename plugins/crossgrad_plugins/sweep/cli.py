@@ -103,7 +103,7 @@ def sweep(given: Options) -> None:
             expected=", ".join(ENGINES),
             todo="leave --engine out to run on this machine",
         )
-    found = Sweep(
+    this_sweep = Sweep(
         Request(
             path=given.grid,
             out=given.out,
@@ -114,15 +114,15 @@ def sweep(given: Options) -> None:
             threads=given.threads,
             memory=given.memory,
             engine=given.engine,
-            options=[_option(each) for each in given.engine_option or ()],
+            options=[_option(text) for text in given.engine_option or ()],
         ),
         read_only=read_only,
     )
     if given.list_runs:
-        raise typer.Exit(found.tell())
+        raise typer.Exit(this_sweep.tell())
     if given.best is not None:
-        raise typer.Exit(found.write_best(given.best))
-    raise typer.Exit(found.foretell() if given.dry_run else found.carry_out())
+        raise typer.Exit(this_sweep.write_best(given.best))
+    raise typer.Exit(this_sweep.foretell() if given.dry_run else this_sweep.carry_out())
 
 
 def _option(text: str) -> tuple[str, str]:

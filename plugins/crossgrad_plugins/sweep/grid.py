@@ -153,12 +153,12 @@ class Grid(_Part):
             return given
         moved = {"scene": "scenes", "seed": "seeds"}
         parameters = dict(given["parameters"])
-        found = {new: parameters.pop(old) for old, new in moved.items() if old in parameters}
-        if twice := sorted(found.keys() & given.keys()):
+        axes = {new: parameters.pop(old) for old, new in moved.items() if old in parameters}
+        if twice := sorted(axes.keys() & given.keys()):
             raise ValueError(
                 f"{listed(twice)} may be given only once, at the top level or among the parameters"
             )
-        return {**given, **{n: _values(p) for n, p in found.items()}, "parameters": parameters}
+        return {**given, **{n: _values(p) for n, p in axes.items()}, "parameters": parameters}
 
 
 def check_assignments(assignments: Iterable[str]) -> None:
@@ -167,7 +167,7 @@ def check_assignments(assignments: Iterable[str]) -> None:
     Raises:
         UserError: The sweep controls a setting itself, or has a separate option for it.
     """
-    for name in (each.partition("=")[0].strip() for each in assignments):
+    for name in (assignment.partition("=")[0].strip() for assignment in assignments):
         instead = f"say {_OPTIONS[name]}" if name in _OPTIONS else _RESERVED.get(name)
         if instead is not None:
             raise UserError(f"{name} cannot be set with --set", where=f"--set {name}", todo=instead)
@@ -203,8 +203,8 @@ class Choice(_Part):
         Raises:
             UserError: An assignment, or a key with a dot, is invalid.
         """
-        own = self.arm.by_scene.get(scene_name(scene), {})
-        layers = (base, self.arm.settings, self.parameters, own)
+        scene_settings = self.arm.by_scene.get(scene_name(scene), {})
+        layers = (base, self.arm.settings, self.parameters, scene_settings)
         return {**layered(layers, assignments), **({} if scene is None else {"scene": scene})}
 
 
@@ -217,20 +217,20 @@ def _values(parameter: object) -> object:
 
 def choices(grid: Grid) -> list[Choice]:
     """Return all configurations, arm by arm; the last parameter varies fastest."""
-    found = []
+    configurations = []
     for arm in grid.arms:
         axes = _axes(grid, arm)
-        found += [
+        configurations += [
             Choice(arm=arm, parameters=dict(zip(axes, values, strict=True)))
             for values in product(*axes.values())
         ]
-    return found
+    return configurations
 
 
 def _axes(grid: Grid, arm: Arm) -> dict[str, tuple[Any, ...]]:
     """Return setting -> values, for the settings that vary in an arm."""
     parameters = {**grid.parameters, **arm.parameters}
-    return dict(axis for name, each in parameters.items() for axis in each.axes(name))
+    return dict(axis for name, parameter in parameters.items() for axis in parameter.axes(name))
 
 
 def read_grid(path: Path) -> Grid:
@@ -243,10 +243,10 @@ def read_grid(path: Path) -> Grid:
     try:
         grid = Grid.model_validate(content)
     except ValidationError as error:
-        refuse([_problem(each) for each in _own(error.errors(include_url=False))], path)
+        refuse([_problem(detail) for detail in _own(error.errors(include_url=False))], path)
         raise
     here = path.resolve().parent
-    scenes = tuple(each and _absolute(each, here) for each in grid.scenes)
+    scenes = tuple(scene and _absolute(scene, here) for scene in grid.scenes)
     grid = grid.model_copy(update={"scenes": scenes})
     refuse(list(_of_the_settings(grid)), path)
     return grid
@@ -259,10 +259,10 @@ def _absolute(scene: str, here: Path) -> str:
 def _own(errors: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     """Drop errors about too few items if the cause is an invalid item of the same list."""
     return [
-        each
-        for each in errors
-        if each["type"] != "too_short"
-        or not any(o["loc"][: len(each["loc"])] == each["loc"] for o in errors if o is not each)
+        error
+        for error in errors
+        if error["type"] != "too_short"
+        or not any(o["loc"][: len(error["loc"])] == error["loc"] for o in errors if o is not error)
     ]
 
 
@@ -276,8 +276,8 @@ def _problem(error: Mapping[str, Any]) -> Problem:
         return Problem(place, f"is not a key of a grid; put settings below {below}", hint)
     message = error["msg"].removeprefix("Value error, ").removeprefix("Input ")
     message = _IN_YAML.get(error["type"], message)
-    found = "" if error["type"] in {"missing", "value_error"} else f", not {error['input']!r}"
-    return Problem(place, f"{message}{found}")
+    rejected = "" if error["type"] in {"missing", "value_error"} else f", not {error['input']!r}"
+    return Problem(place, f"{message}{rejected}")
 
 
 def _of_the_settings(grid: Grid) -> Iterator[Problem]:
@@ -357,5 +357,5 @@ def with_scenes(grid: Grid, scenes: Sequence[Path]) -> Grid:
         )
         for arm in grid.arms
     )
-    found = tuple(str(path.resolve()) for path in scenes)
-    return grid.model_copy(update={"scenes": found, "arms": arms})
+    folders = tuple(str(path.resolve()) for path in scenes)
+    return grid.model_copy(update={"scenes": folders, "arms": arms})

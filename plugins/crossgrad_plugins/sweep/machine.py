@@ -49,8 +49,8 @@ def divided(workers: int | None, threads: int, memory: float | None) -> Machine:
     if not by_cores:
         raise _too_many("--threads", f"1 to {len(cores)}", str(threads))
     usable = None if there is None else floor(SHARE * there)
-    each = LEAST if memory is None else floor(memory * _GIB)
-    by_memory = by_cores if usable is None else max(usable // each, memory is None)
+    per_worker = LEAST if memory is None else floor(memory * _GIB)
+    by_memory = by_cores if usable is None else max(usable // per_worker, memory is None)
     if not by_memory:
         raise _too_many("--memory", f"at most {(usable or 0) / _GIB:.1f}", f"{memory:g} GiB")
     most = min(by_cores, by_memory)
@@ -63,7 +63,7 @@ def divided(workers: int | None, threads: int, memory: float | None) -> Machine:
         cores = idle_first(cores)
     return Machine(
         cores=tuple(tuple(cores[n * threads : (n + 1) * threads]) for n in range(count)),
-        memory=each if memory is not None else share,
+        memory=per_worker if memory is not None else share,
     )
 
 

@@ -43,10 +43,10 @@ class Plan:
     @property
     def jobs(self) -> tuple[Job, ...]:
         """The runs of the plan, without repetitions."""
-        found: dict[str, Job] = {}
+        by_id: dict[str, Job] = {}
         for job in self.cells:
-            found.setdefault(job.id, job)
-        return tuple(found.values())
+            by_id.setdefault(job.id, job)
+        return tuple(by_id.values())
 
 
 def planned(grid: Grid, path: Path, assignments: Sequence[str] = ()) -> Plan:
@@ -68,10 +68,10 @@ def planned(grid: Grid, path: Path, assignments: Sequence[str] = ()) -> Plan:
         checked = [planner.checked(scene, choice) for scene, choice in pairs]
     refuse(planner.problems(), path)
     cells = [
-        _job(scene, choice, seed, found)
+        _job(scene, choice, seed, configuration)
         for seed in grid.seeds
-        for (scene, choice), found in zip(pairs, checked, strict=True)
-        if found is not None
+        for (scene, choice), configuration in zip(pairs, checked, strict=True)
+        if configuration is not None
     ]
     return Plan(grid, tuple(cells))
 
@@ -100,26 +100,26 @@ class _Planner:
 
     def checked(self, scene: str | None, choice: Choice) -> _Checked | None:
         """Check a configuration on a scene; return None if it has a problem."""
-        place = choice.label
+        label = choice.label
         try:
             settings = choice.settings(self.base, scene, self.assignments)
             config = configured(settings)
         except UserError as error:
-            self._note(place, error)
+            self._note(label, error)
             return None
         faults = list(_faults(config))
         for fault in faults:
-            self._note(place, fault)
-        found = self._scene(config)
-        if faults or found is None:
+            self._note(label, fault)
+        scene_parts = self._scene(config)
+        if faults or scene_parts is None:
             return None
         try:
-            setup = assemble_new(config, found[0], found[1])
+            setup = assemble_new(config, scene_parts[0], scene_parts[1])
         except UserError as error:
-            self._note(f"{scene_name(scene)}, {place}", error)
+            self._note(f"{scene_name(scene)}, {label}", error)
             return None
         final = {**resolved(setup), "seconds": config.seconds}
-        return _Checked(settings, final, found[2])
+        return _Checked(settings, final, scene_parts[2])
 
     def _scene(self, config: "RunConfig") -> Any:  # noqa: ANN401 - a scene, its reader, its digest
         """Read the scene as configured; return None if it cannot be read."""
@@ -154,12 +154,12 @@ def _faults(config: "RunConfig") -> Iterator[UserError]:
             yield error
 
 
-def _job(scene: str | None, choice: Choice, seed: int, found: _Checked) -> Job:
+def _job(scene: str | None, choice: Choice, seed: int, configuration: _Checked) -> Job:
     return Job(
-        id=run_id({**found.resolved, "seed": seed}, found.fingerprint),
+        id=run_id({**configuration.resolved, "seed": seed}, configuration.fingerprint),
         label=choice.label,
         scene=scene_name(scene),
         seed=seed,
-        settings={**found.settings, "seed": seed},
-        seconds=found.resolved["seconds"],
+        settings={**configuration.settings, "seed": seed},
+        seconds=configuration.resolved["seconds"],
     )

@@ -54,15 +54,15 @@ class Watch:
 
     def __post_init__(self) -> None:
         self._known = set(read_records(self.layout.records))
-        self._jobs = {each.job.id: each.job for each in self.before}
+        self._jobs = {standing.job.id: standing.job for standing in self.before}
         self._begun: dict[str, Record] = {}
 
     def look(self) -> list[Record]:
         """Read new records; return the records of runs that ended since the previous call."""
         # The clocks of machines differ, so a new record may have an earlier time.
-        found = [each for each in read_records(self.layout.records) if each not in self._known]
-        self._known.update(found)
-        new = [each for each in found if each.run in self._jobs]
+        unread = [entry for entry in read_records(self.layout.records) if entry not in self._known]
+        self._known.update(unread)
+        new = [entry for entry in unread if entry.run in self._jobs]
         for record in new:
             if record.event == "begun":
                 self._begun[record.run] = record
@@ -73,7 +73,7 @@ class Watch:
             UnderWay(self._jobs[run], record, newest_row(self.layout.run(run)))
             for run, record in self._begun.items()
         )
-        return [each for each in new if each.event == "ended"]
+        return [entry for entry in new if entry.event == "ended"]
 
     def job(self, record: Record) -> Job:
         """Return the run of a record."""
@@ -83,22 +83,23 @@ class Watch:
     def finished(self) -> int:
         """Number of finished runs, including runs that finished earlier."""
         return sum(
-            each.state == "finished" or self._is(each.job, "finished") for each in self.before
+            standing.state == "finished" or self._is(standing.job, "finished")
+            for standing in self.before
         )
 
     @property
     def failed(self) -> list[Record]:
         """The last records of runs that failed since the sweep started."""
-        return [each for each in self.ended.values() if each.status == "failed"]
+        return [record for record in self.ended.values() if record.status == "failed"]
 
     @property
     def left(self) -> list[Job]:
         """Runs that are neither finished nor failed, including active runs."""
         return [
-            each.job
-            for each in self.before
-            if each.state != "finished"
-            and not (self._is(each.job, "finished") or self._is(each.job, "failed"))
+            standing.job
+            for standing in self.before
+            if standing.state != "finished"
+            and not (self._is(standing.job, "finished") or self._is(standing.job, "failed"))
         ]
 
     def _is(self, job: Job, status: str) -> bool:
@@ -146,14 +147,14 @@ class Screen:
     def _table(self) -> list[str]:
         watch = self._watch
         total, left = len(watch.before), len(watch.left)
-        jobs = {each.job.id: each.job for each in watch.before}
+        jobs = {standing.job.id: standing.job for standing in watch.before}
         time = estimated(watch.left, jobs, read_records(watch.layout.records))
         counts = f"{watch.finished} of {total} finished, {len(watch.failed)} failed, {left} left"
         return [f"{counts}; {time.text(self._at_a_time)}", *map(_line, watch.under_way)]
 
     def _failures(self) -> list[str]:
         failed = self._watch.failed
-        shown = [f"  failed: {self._end(each)}" for each in failed[-MOST_FAILURES:]]
+        shown = [f"  failed: {self._end(record)}" for record in failed[-MOST_FAILURES:]]
         more = len(failed) - len(shown)
         return [*([f"  {more} earlier failures"] if more else []), *shown]
 
@@ -166,10 +167,10 @@ class Screen:
         return f"{count}  {watch.job(record).title}: {record.status}{took}{reason}"
 
 
-def _line(each: UnderWay) -> str:
-    passed = duration((datetime.now(UTC) - each.record.when).total_seconds())
-    cells = [f"{name} {each.row[name][:7]}" for name in ("step", "psnr") if each.row.get(name)]
-    return f"  {each.record.worker:>8}  {each.job.title}  {passed}  {'  '.join(cells)}".rstrip()
+def _line(active: UnderWay) -> str:
+    passed = duration((datetime.now(UTC) - active.record.when).total_seconds())
+    cells = [f"{name} {active.row[name][:7]}" for name in ("step", "psnr") if active.row.get(name)]
+    return f"  {active.record.worker:>8}  {active.job.title}  {passed}  {'  '.join(cells)}".rstrip()
 
 
 def _write(text: str) -> None:
@@ -200,10 +201,10 @@ class Estimate:
                 if self.unknown
                 else "nothing to do"
             )
-        known = f"about {duration(max(self.seconds / at_a_time, self.longest))}"
+        estimate = f"about {duration(max(self.seconds / at_a_time, self.longest))}"
         unknown = f"; the time of {count(self.unknown, 'run')} is not known yet"
         others = unknown if self.unknown else ""
-        return known + others
+        return estimate + others
 
 
 def estimated(jobs: Sequence[Job], of: Mapping[str, Job], records: Iterable[Record]) -> Estimate:
@@ -222,9 +223,9 @@ def estimated(jobs: Sequence[Job], of: Mapping[str, Job], records: Iterable[Reco
             job = of[record.run]
             for key in ((job.scene, job.label), (job.scene,)):
                 same.setdefault(key, []).append(record.seconds)
-    found = [_seconds(job, same) for job in jobs]
-    known = [each for each in found if each is not None]
-    return Estimate(sum(known), len(found) - len(known), max(known, default=0.0))
+    estimates = [_seconds(job, same) for job in jobs]
+    known = [seconds for seconds in estimates if seconds is not None]
+    return Estimate(sum(known), len(estimates) - len(known), max(known, default=0.0))
 
 
 def _seconds(job: Job, same: Mapping[tuple[str, ...], Sequence[float]]) -> float | None:

@@ -161,7 +161,9 @@ def _is_whole(path: Path) -> bool:
 def read_records(folder: Path) -> list[Record]:
     """Read the records of all workers, ordered by time, without incomplete or invalid lines."""
     paths = sorted(folder.glob("*.jsonl"))
-    return sorted((each for path in paths for each in _lines(path)), key=lambda each: each.time)
+    return sorted(
+        (record for path in paths for record in _lines(path)), key=lambda record: record.time
+    )
 
 
 def _lines(path: Path) -> Iterator[Record]:

@@ -21,11 +21,11 @@ _COLUMNS = ("run", "scene", "configuration", "seed")
 
 def listing(cells: Iterable[Job], standings: Iterable[Standing]) -> Iterator[str]:
     """Yield a line for each combination: id, state and description."""
-    state = {each.job.id: each for each in standings}
+    state = {entry.job.id: entry for entry in standings}
     for job in cells:
-        found = state[job.id]
-        error = f": {' '.join(found.error.split())}" if found.error else ""
-        yield f"{job.id}  {found.state:<11}  {job.title}{error}"
+        standing = state[job.id]
+        error = f": {' '.join(standing.error.split())}" if standing.error else ""
+        yield f"{job.id}  {standing.state:<11}  {job.title}{error}"
 
 
 def table(cells: Sequence[Job], standings: Iterable[Standing], metric: Metric) -> Iterator[str]:
@@ -34,30 +34,33 @@ def table(cells: Sequence[Job], standings: Iterable[Standing], metric: Metric) -
     An asterisk marks the best mean of each scene. If no finished run has the figure, a line lists
     the figures that the runs have.
     """
-    known = tuple(standings)
-    values = {each.job.id: figure(each, metric.name) for each in known}
-    found: dict[tuple[str, str], list[float]] = {}
+    all_standings = tuple(standings)
+    values = {standing.job.id: figure(standing, metric.name) for standing in all_standings}
+    results: dict[tuple[str, str], list[float]] = {}
     for job in cells:
         if (value := values[job.id]) is not None:
-            found.setdefault((job.label, job.scene), []).append(value)
+            results.setdefault((job.label, job.scene), []).append(value)
     labels = list(dict.fromkeys(job.label for job in cells))
     scenes = list(dict.fromkeys(job.scene for job in cells))
-    best = {scene: _best(found, scene, metric) for scene in scenes}
+    best = {scene: _best(results, scene, metric) for scene in scenes}
     rows = [[f"{metric.name}, mean over seeds", *scenes]]
     rows += [
-        [label, *(_cell(found.get((label, scene)), best[scene]) for scene in scenes)]
+        [label, *(_cell(results.get((label, scene)), best[scene]) for scene in scenes)]
         for label in labels
     ]
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     for row in rows:
         yield "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-    if not found and any(each.summary for each in known):
-        there = listed(sorted({name for each in known for name in figures(each)})) or "no figures"
+    if not results and any(standing.summary for standing in all_standings):
+        there = (
+            listed(sorted({name for standing in all_standings for name in figures(standing)}))
+            or "no figures"
+        )
         yield f"no finished run has {metric.name}; the runs have {there} (`metric` of the grid)"
 
 
-def _best(found: dict[tuple[str, str], list[float]], scene: str, metric: Metric) -> float | None:
-    means = [mean(values) for (_, where), values in found.items() if where == scene]
+def _best(results: dict[tuple[str, str], list[float]], scene: str, metric: Metric) -> float | None:
+    means = [mean(values) for (_, where), values in results.items() if where == scene]
     if not means:
         return None
     return max(means) if metric.goal == "maximize" else min(means)
@@ -77,11 +80,11 @@ def write_plan(layout: Layout, cells: Iterable[Job]) -> None:
     A run that is in both grids gets its name in the new grid.
     """
     rows = [(job.id, job.scene, job.label, str(job.seed)) for job in cells]
-    known = {run for run, *_ in rows}
+    ids = {run for run, *_ in rows}
     rows += [
         (run, scene, label, seed)
         for run, scene, label, seed in _read_plan(layout, writes=True)
-        if run not in known and layout.run(run).is_dir()
+        if run not in ids and layout.run(run).is_dir()
     ]
     drop_checksums(layout.out)
     write_table(layout.plan, [dict(zip(_COLUMNS, row, strict=True)) for row in rows])

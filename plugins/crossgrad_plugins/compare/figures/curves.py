@@ -28,8 +28,8 @@ def draw_curves(c: Comparison, cost: Cost) -> Drawn:
 
     def panel(ax: "Axes", scene: str) -> None:
         limits = draw_bands(ax, c, scene, c.quantity, cost)
-        low = min((np.quantile(each, _KEPT) for each in limits[::2]), default=0.0)
-        high = max((each.max() for each in limits[1::2]), default=0.0)
+        low = min((np.quantile(limit, _KEPT) for limit in limits[::2]), default=0.0)
+        high = max((limit.max() for limit in limits[1::2]), default=0.0)
         if high > low:
             ax.set_ylim(low - 0.06 * (high - low), high + 0.06 * (high - low))
 
@@ -70,12 +70,14 @@ def draw_frontier(c: Comparison, cost: Cost) -> Drawn | None:
         from matplotlib.ticker import LogLocator, NullLocator
 
         for arm in c.main:
-            own = [p for p in c.points if (p.arm, p.scene) == (arm, scene) and cost.name in p.spent]
-            own = sorted(own, key=lambda p: p.spent[cost.name])
+            arm_points = [
+                p for p in c.points if (p.arm, p.scene) == (arm, scene) and cost.name in p.spent
+            ]
+            arm_points = sorted(arm_points, key=lambda p: p.spent[cost.name])
             ax.errorbar(
-                [point.spent[cost.name] for point in own],
-                [point.mean for point in own],
-                yerr=np.nan_to_num([point.spread for point in own]),
+                [point.spent[cost.name] for point in arm_points],
+                [point.mean for point in arm_points],
+                yerr=np.nan_to_num([point.spread for point in arm_points]),
                 color=look[arm].color,
                 marker=look[arm].marker,
                 linestyle=look[arm].dash,
@@ -110,8 +112,8 @@ def draw_regimes(c: Comparison) -> Drawn:
         for index, (arm, by) in enumerate(c.main.items()):
             shift = _SPREAD * (index / gaps - 0.5) if len(c.main) > 1 else 0.0
             runs = [run for (at, _), run in by.items() if at == scene]
-            for place, regime in enumerate(groups):
-                at = place + shift
+            for position, regime in enumerate(groups):
+                at = position + shift
                 values = [v for run in runs if (v := run.final(c.quantity.name, regime))
                           is not None]  # fmt: skip
                 ax.plot([at] * len(values), values, look[arm].marker, markersize=3.2,
@@ -144,14 +146,14 @@ def draw_profile(c: Comparison) -> Drawn | None:
     at = np.linspace(1.0, LARGEST_RATIO, _POINTS)
 
     def panel(ax: "Axes", index: int) -> None:
-        for arm, own in list(shown.values())[index].items():
-            share = [np.mean(np.asarray(own) <= ratio + 1e-9) for ratio in at]
+        for arm, arm_ratios in list(shown.values())[index].items():
+            share = [np.mean(np.asarray(arm_ratios) <= ratio + 1e-9) for ratio in at]
             ax.plot(at, share, color=look[arm].color, linestyle=look[arm].dash, label=literal(arm))
         ax.set_xlim(1.0, LARGEST_RATIO)
         ax.set_ylim(-0.02, 1.02)
         ax.tick_params(axis="y", labelleft=index == 0)
 
-    problems = max(len(own) for by in shown.values() for own in by.values())
+    problems = max(len(arm_ratios) for by in shown.values() for arm_ratios in by.values())
     return Grid(
         "profile",
         "Performance profile",

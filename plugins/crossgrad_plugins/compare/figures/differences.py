@@ -41,7 +41,7 @@ _COLORS: Final = {
 
 def draw_differences(c: Comparison) -> Drawn | None:
     """Draw all contrasts of the main metric; return None for a single arm."""
-    by_regime = (each for each in c.regimes if each.where != OVERALL)
+    by_regime = (contrast for contrast in c.regimes if contrast.where != OVERALL)
     rows = [*c.ends, *c.equal, *by_regime][:_MOST_ROWS]
     if not rows:
         return None
@@ -58,9 +58,9 @@ def draw_differences(c: Comparison) -> Drawn | None:
         dots = [pair.difference for row in rows for pair in row.pairs]
         low, high = min([*dots, -2.0 * margin]), max([*dots, 2.0 * margin])
         ax.set_xlim(low - 0.1 * (high - low), high + 0.1 * (high - low))
-        places = _draw(ax, rows, c.scenes)
-        ax.set_yticks(places, [literal(where_text(row)) for row in rows])
-        ax.set_ylim(places[-1] + 0.6, -0.6)
+        positions = _draw(ax, rows, c.scenes)
+        ax.set_yticks(positions, [literal(where_text(row)) for row in rows])
+        ax.set_ylim(positions[-1] + 0.6, -0.6)
         ax.grid(visible=False, axis="y")
         ax.tick_params(axis="y", length=0)
         ax.spines["left"].set_visible(False)
@@ -86,29 +86,29 @@ def _heading(row: Contrast) -> str:
 
 def _draw(ax: "Axes", rows: Sequence[Contrast], scenes: Sequence[str]) -> list[float]:
     """Draw the rows below the headings of their arms, and return the position of each row."""
-    places: list[float] = []
-    place = 0.0
-    for heading, own in groupby(rows, _heading):
-        place += _LINE * heading.count("\n")
-        ax.text(0.0, place + 0.25, heading, fontweight="bold",
+    positions: list[float] = []
+    position = 0.0
+    for heading, group in groupby(rows, _heading):
+        position += _LINE * heading.count("\n")
+        ax.text(0.0, position + 0.25, heading, fontweight="bold",
                 transform=ax.get_yaxis_transform())  # fmt: skip
-        for row in own:
-            place += 1.0
-            _row(ax, row, place, scenes)
-            places.append(place)
-        place += 1.0
-    return places
+        for row in group:
+            position += 1.0
+            _row(ax, row, position, scenes)
+            positions.append(position)
+        position += 1.0
+    return positions
 
 
-def _row(ax: "Axes", row: Contrast, place: float, scenes: Sequence[str]) -> None:
+def _row(ax: "Axes", row: Contrast, position: float, scenes: Sequence[str]) -> None:
     color, estimate = _COLORS[row.verdict], row.estimate
     for index, scene in enumerate(scenes):
-        own = [pair.difference for pair in row.pairs if pair.scene == scene]
-        ax.plot(own, [place + 0.2] * len(own), MARKERS[index % len(MARKERS)], color=FAINT,
-                alpha=0.55, markersize=2.4, markeredgewidth=0)  # fmt: skip
+        differences = [pair.difference for pair in row.pairs if pair.scene == scene]
+        ax.plot(differences, [position + 0.2] * len(differences), MARKERS[index % len(MARKERS)],
+                color=FAINT, alpha=0.55, markersize=2.4, markeredgewidth=0)  # fmt: skip
     if estimate is None:
         return
-    above = place - _ABOVE
+    above = position - _ABOVE
     if estimate.pairs > 1:
         ax.plot(estimate.wide, [above] * 2, color=color, linewidth=1.1)
         ax.plot(estimate.narrow, [above] * 2, color=color, linewidth=2.8)

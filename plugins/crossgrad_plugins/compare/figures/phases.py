@@ -29,45 +29,50 @@ def phases_of(comparison: Comparison) -> dict[str, dict[str, float]]:
     Phases are wall-clock seconds. The result is empty if wall-clock seconds are not comparable or
     not requested.
     """
-    found: dict[str, dict[str, float]] = {}
+    by_arm: dict[str, dict[str, float]] = {}
     if SECONDS not in comparison.costs:
-        return found
+        return by_arm
     for arm, by in comparison.main.items():
         runs = [run for run in by.values() if run.number("step")]
         recorded = [run.summary.get("seconds", {}).get("phases") or {} for run in runs]
-        each = [
-            {name: 1000.0 * seconds / (run.number("step") or 1.0) for name, seconds in own.items()}
-            for run, own in zip(runs, recorded, strict=True)
-            if own
+        per_run = [
+            {
+                name: 1000.0 * seconds / (run.number("step") or 1.0)
+                for name, seconds in phases.items()
+            }
+            for run, phases in zip(runs, recorded, strict=True)
+            if phases
         ]
-        if each:
-            names = list(dict.fromkeys(name for own in each for name in own))
-            found[arm] = {n: float(np.mean([own.get(n, 0.0) for own in each])) for n in names}
-    return found
+        if per_run:
+            names = list(dict.fromkeys(name for phases in per_run for name in phases))
+            by_arm[arm] = {
+                n: float(np.mean([phases.get(n, 0.0) for phases in per_run])) for n in names
+            }
+    return by_arm
 
 
 def draw_phases(comparison: Comparison) -> Drawn | None:
     """Draw milliseconds per step by phase, one bar per arm; return None without comparable runs."""
-    found = phases_of(comparison)
-    if not found:
+    by_arm = phases_of(comparison)
+    if not by_arm:
         return None
-    names = list(dict.fromkeys(name for own in found.values() for name in own))
+    names = list(dict.fromkeys(name for phases in by_arm.values() for name in phases))
     colors = {
         name: FAINT if name == _OTHER else COLORS[index % len(COLORS)]
         for index, name in enumerate(names)
     }
     with styled():
-        figure = new_figure(PAGE, 0.85 + 0.3 * len(found))
+        figure = new_figure(PAGE, 0.85 + 0.3 * len(by_arm))
         ax = figure.subplots()
-        for place, own in enumerate(found.values()):
+        for row, phases in enumerate(by_arm.values()):
             left = 0.0
             for index, name in enumerate(names):
-                wide = own.get(name, 0.0)
-                ax.barh(place, wide, left=left, height=0.62, color=colors[name], alpha=0.85,
+                wide = phases.get(name, 0.0)
+                ax.barh(row, wide, left=left, height=0.62, color=colors[name], alpha=0.85,
                         hatch=_HATCHES[index % len(_HATCHES)], edgecolor="white", linewidth=0.4,
-                        label=None if place else name.replace("_", " "))  # fmt: skip
+                        label=None if row else name.replace("_", " "))  # fmt: skip
                 left += wide
-        ax.set_yticks(range(len(found)), [wrapped(literal(arm), _LETTERS) for arm in found])
+        ax.set_yticks(range(len(by_arm)), [wrapped(literal(arm), _LETTERS) for arm in by_arm])
         ax.invert_yaxis()
         ax.grid(visible=False, axis="y")
         ax.set_xlabel("milliseconds of a training step")

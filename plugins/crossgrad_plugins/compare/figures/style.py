@@ -162,8 +162,8 @@ def drawn(figure: "Figure", name: str, title: str, caption: str) -> Drawn:
 
 def _for_page(svg: str, name: str) -> str:
     """Return the SVG element alone, with unique ids and with colours that the page sets."""
-    found = _SVG.search(svg)
-    text = _ID.sub(rf"\1{name}-", found[0] if found else svg)
+    match = _SVG.search(svg)
+    text = _ID.sub(rf"\1{name}-", match[0] if match else svg)
     for variable, color in variables().items():
         text = text.replace(color, f"var(--{variable})").replace(
             color.lower(), f"var(--{variable})"
@@ -185,17 +185,17 @@ def literal(text: str) -> str:
 
 def panel_title(ax: "Axes", scene: str) -> None:
     """Write a scene's name above its panel, on several lines if the panel is too narrow."""
-    place = ax.get_subplotspec()
-    beside = 1 if place is None else place.get_gridspec().ncols
+    subplot = ax.get_subplotspec()
+    beside = 1 if subplot is None else subplot.get_gridspec().ncols
     ax.set_title(wrapped(literal(one_line(scene)), _LETTERS // beside - _BESIDE), loc="left")
 
 
 def legend(figure: "Figure", axes: "Axes", arms: Sequence[str], columns: int = 4) -> None:
     """Put the legend of the arms above all panels, with the handles of `axes`."""
     handles, labels = axes.get_legend_handles_labels()
-    known = dict(zip(labels, handles, strict=True))
-    shown = [literal(arm) for arm in arms if literal(arm) in known]
-    legend_above(figure, [known[label] for label in shown], shown, columns)
+    by_label = dict(zip(labels, handles, strict=True))
+    shown = [literal(arm) for arm in arms if literal(arm) in by_label]
+    legend_above(figure, [by_label[label] for label in shown], shown, columns)
 
 
 def legend_above(

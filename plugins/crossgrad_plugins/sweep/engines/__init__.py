@@ -111,5 +111,5 @@ def check_options(name: str, options: Iterable[str]) -> None:
 
 def engine(name: str) -> Engine:
     """Import the engine with the given name."""
-    found: Engine = import_module(ENGINES[name]).carry_out
-    return found
+    carry_out: Engine = import_module(ENGINES[name]).carry_out
+    return carry_out

@@ -76,12 +76,12 @@ class _WorkerPool:
 
     def _outcome(self, task: object) -> Outcome:
         try:
-            found: Outcome = self._ray.get(task)
+            outcome: Outcome = self._ray.get(task)
         except self._ray.exceptions.TaskCancelledError:
             return Outcome("stopped")
         except self._ray.exceptions.RayError as error:
             return Outcome("died", str(error))
-        return found
+        return outcome
 
 
 def _carried_out(job: Job, worker: Worker) -> Outcome:
@@ -118,8 +118,8 @@ def _connected(work: Work) -> ModuleType:
         ) from error
     for number, handler in handlers.items():  # Ray installs its own signal handlers.
         signal.signal(number, handler)
-    found: ModuleType = ray
-    return found
+    module: ModuleType = ray
+    return module
 
 
 def _ping(address: str | None) -> None:

@@ -53,14 +53,14 @@ def script(work: Work) -> str:
         parameters["mem"] = _convert_mem(work.memory)
     parameters |= {name: work.options[name] for name in SBATCH if name in work.options}
     command = "python -u -m submitit.core._submit " + str(work.out / "slurm")
-    found: str = _make_sbatch_string(
+    text: str = _make_sbatch_string(
         command,
         folder=work.out / "slurm" / "%j",
         map_count=max(1, len(work.jobs)),
         array_parallelism=work.workers or _MOST,
         **parameters,
     )
-    return found
+    return text
 
 
 class Task:
@@ -119,7 +119,7 @@ class _WorkerPool:
             self._asked = stop.count
             for handed, _ in self._under_way:
                 handed.cancel(check=False)
-        for handed, job in [each for each in self._under_way if each[0].done()]:
+        for handed, job in [entry for entry in self._under_way if entry[0].done()]:
             self._under_way.remove((handed, job))
             if self._tries.once_more(job, self._outcome(handed)) and not stop.count:
                 self._waiting.appendleft(job)
@@ -137,12 +137,12 @@ class _WorkerPool:
         if self._asked:
             return Outcome("stopped")
         try:
-            found: Outcome = handed.result()
+            outcome: Outcome = handed.result()
         except self._submitit.core.utils.UncompletedJobError as error:
             return Outcome("died", str(error).splitlines()[0])
         except self._submitit.core.utils.FailedJobError as error:
             return Outcome("died", str(error).splitlines()[-1])
-        return found
+        return outcome
 
 
 def _executor(work: Work, submitit: ModuleType) -> Any:  # noqa: ANN401 - an executor of submitit
@@ -166,12 +166,12 @@ def _executor(work: Work, submitit: ModuleType) -> Any:  # noqa: ANN401 - an exe
 
 def _general(work: Work) -> dict[str, Any]:
     """Return the parameters that every executor of submitit accepts."""
-    found: dict[str, Any] = {
+    parameters: dict[str, Any] = {
         "name": _NAME,
         "timeout_min": _minutes(work),
         "cpus_per_task": work.threads,
     }
-    return found if work.memory is None else {**found, "mem_gb": work.memory}
+    return parameters if work.memory is None else {**parameters, "mem_gb": work.memory}
 
 
 def _minutes(work: Work) -> int:
@@ -198,5 +198,5 @@ def _submitit() -> ModuleType:
             found=str(error),
             todo="pip install 'crossgrad[slurm]'",
         ) from error
-    found: ModuleType = submitit
-    return found
+    module: ModuleType = submitit
+    return module
