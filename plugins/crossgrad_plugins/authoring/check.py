@@ -33,17 +33,17 @@ def check_package(package: str) -> tuple[str, bool]:
     Raises:
         UserError: No such package is installed, or it offers no plugin.
     """
-    found, lost = entries_of(package), _strays_of(package)
-    origins = sorted({f"{entry.distribution} {entry.version}" for entry in found})
+    plugins, lost = entries_of(package), _strays_of(package)
+    origins = sorted({f"{entry.distribution} {entry.version}" for entry in plugins})
     lines, failed = [", ".join(origins)], 0
-    width = max(len(_label(entry)) for entry in found)
-    for entry in found:
+    width = max(len(_label(entry)) for entry in plugins)
+    for entry in plugins:
         results = check_entry(entry)
         failures = [result for result in results if result.failure is not None]
         failed += bool(failures)
         lines.append(f"  {_label(entry):<{width}}  {_verdict(results, failures)}")
         lines += [_reason(result) for result in failures]
-    total = len(found) + len(lost)
+    total = len(plugins) + len(lost)
     for stray in lost:
         lines += [
             f"  {stray.name}  FAIL",
@@ -56,7 +56,7 @@ def check_package(package: str) -> tuple[str, bool]:
 
 def _strays_of(package: str) -> list[Stray]:
     """Return the entry points of a package in groups that do not exist."""
-    return [each for each in strays() if _normalized(each.distribution) == _normalized(package)]
+    return [stray for stray in strays() if _normalized(stray.distribution) == _normalized(package)]
 
 
 def entries_of(package: str) -> list[Entry]:
@@ -66,25 +66,27 @@ def entries_of(package: str) -> list[Entry]:
         UserError: For the reasons of `check_package`.
     """
     offered = [entry for slot in OFFERED for entry in offers(slot)]
-    found = [entry for entry in offered if package in _names_of(entry)]
-    found = found or [
+    plugins = [entry for entry in offered if package in _names_of(entry)]
+    plugins = plugins or [
         entry for entry in offered if _normalized(package) == _normalized(entry.distribution)
     ]
-    if found:
-        return found
-    known = sorted({entry.distribution for entry in offered})
+    if plugins:
+        return plugins
+    packages = sorted({entry.distribution for entry in offered})
     if _is_installed(package):
         raise UserError(
             f"package {package!r} contains no plugins",
             expected=f"entry points in a group such as {GROUPS['operators']}",
-            found=sentences(*(f"{each.name}: {each.reason}" for each in _strays_of(package))),
+            found=sentences(*(f"{stray.name}: {stray.reason}" for stray in _strays_of(package))),
             todo="declare the plugins in pyproject.toml (docs/plugins.md) and install the "
             "package again",
         )
     raise UserError(
         f"no package named {package!r} is installed",
-        expected=f"a package such as {', '.join(known)}",
-        todo=sentences(did_you_mean(package, known), "install it into this environment with pip"),
+        expected=f"a package such as {', '.join(packages)}",
+        todo=sentences(
+            did_you_mean(package, packages), "install it into this environment with pip"
+        ),
     )
 
 

@@ -55,10 +55,10 @@ def plugins(context: typer.Context) -> None:
 @app.command("list", cls=GroupedCommand)
 def list_plugins(slot: SlotOption = None) -> None:
     """Show the installed plugins by slot, and the commands they add."""
-    for each in _slots(slot):
-        typer.echo(each)
-        typer.echo("\n".join(_rows(offers(each))) or "  none installed")
-    if lost := [f"  {each.name}  {each.origin}: {each.reason}" for each in strays()]:
+    for group in _slots(slot):
+        typer.echo(group)
+        typer.echo("\n".join(_rows(offers(group))) or "  none installed")
+    if lost := [f"  {stray.name}  {stray.origin}: {stray.reason}" for stray in strays()]:
         typer.echo("\n".join(["never read", *lost]))
     typer.echo("\n`crossgrad plugins show NAME` explains a plugin.")
 
@@ -71,15 +71,15 @@ def show(
     """Show the purpose, the options and the origin of a plugin."""
     from crossgrad_plugins.authoring.describe import describe
 
-    found = [entry for each in _slots(slot) for entry in offers(each)]
-    chosen = [entry for entry in found if entry.name == name]
+    installed = [entry for group in _slots(slot) for entry in offers(group)]
+    chosen = [entry for entry in installed if entry.name == name]
     if not chosen:
-        slots = [each for each in _slots(None) if any(e.name == name for e in offers(each))]
+        slots = [group for group in _slots(None) if any(e.name == name for e in offers(group))]
         raise UserError(
             f"there is no plugin named {name!r}" + (f" among the {slot}" if slot else ""),
             found=f"a plugin with this name among the {listed(slots)}" if slots else "",
             todo=sentences(
-                did_you_mean(name, [entry.name for entry in found]),
+                did_you_mean(name, [entry.name for entry in installed]),
                 "`crossgrad plugins list` shows all plugins",
             ),
         )
@@ -180,11 +180,11 @@ def _slots(slot: str | None) -> tuple[str, ...]:
     return (group,)
 
 
-def _rows(found: tuple[Entry, ...]) -> list[str]:
-    names = [entry.name for entry in found]
+def _rows(offered: tuple[Entry, ...]) -> list[str]:
+    names = [entry.name for entry in offered]
     width = max((len(name) for name in names), default=0)
     rows = []
-    for entry in found:
+    for entry in offered:
         note = ""
         if names.count(entry.name) > 1:
             note = "  two packages offer this name: choosing it is an error"

@@ -56,7 +56,7 @@ def describe(entry: Entry) -> str:
         "\n".join(f"{_MARGIN}{label}: {text}" for label, text in _traits(component)),
         _options(entry, component),
     ]
-    return "\n\n".join(part for part in parts if part)
+    return "\n\n".join(section for section in parts if section)
 
 
 def _heading(entry: Entry) -> str:
@@ -88,7 +88,7 @@ def _filled(block: str) -> str:
 
 
 def _traits(component: "type[Component]") -> list[tuple[str, object]]:
-    found: list[tuple[str, object]] = []
+    traits: list[tuple[str, object]] = []
     for attribute, label in _TRAITS.items():
         if attribute not in component.model_fields and hasattr(component, attribute):
             value = getattr(component, attribute)
@@ -96,8 +96,8 @@ def _traits(component: "type[Component]") -> list[tuple[str, object]]:
                 continue  # The answer depends on the options.
             value = sorted(value) if isinstance(value, frozenset) else value
             if value:
-                found.append((label, listed(value) if isinstance(value, list | tuple) else value))
-    return found
+                traits.append((label, listed(value) if isinstance(value, list | tuple) else value))
+    return traits
 
 
 def _options(entry: Entry, component: "type[Component]") -> str:
@@ -129,7 +129,7 @@ def _type_name(annotation: object) -> str:
         return _type_name(arguments[0])
     if origin is Literal:
         return " | ".join(str(choice) for choice in arguments)
-    names = [_type_name(each) for each in arguments if each is not Ellipsis]
+    names = [_type_name(argument) for argument in arguments if argument is not Ellipsis]
     if origin in (Union, UnionType):
         return " | ".join(names)
     if annotation is type(None):
@@ -140,13 +140,13 @@ def _type_name(annotation: object) -> str:
 
 def _bounds(constraints: list[Any]) -> list[str]:
     """Return a text such as `>= 0` for each bound of pydantic."""
-    found = [
+    bounds = [
         f"{sign} {getattr(constraint, attribute)}"
         for constraint in constraints
         for attribute, sign in _SIGNS.items()
         if getattr(constraint, attribute, None) is not None
     ]
-    return found + [
+    return bounds + [
         f"{words} {getattr(constraint, attribute)} items"
         for constraint in constraints
         for attribute, words in _LENGTHS.items()

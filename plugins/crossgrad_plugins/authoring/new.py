@@ -68,12 +68,12 @@ def examples() -> dict[str, tuple[Path, str]]:
     folder = next(folder for folder in _EXAMPLES if folder.is_dir())
     project = tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     slots = {group: slot for slot, group in OFFERED.items()}
-    found = {}
+    sources = {}
     for group, plugins in project["entry-points"].items():
         (value,) = plugins.values()
         module, _, member = value.partition(":")
-        found[slots[group]] = folder.joinpath(*module.split(".")).with_suffix(".py"), member
-    return found
+        sources[slots[group]] = folder.joinpath(*module.split(".")).with_suffix(".py"), member
+    return sources
 
 
 def write_package(name: str, slot: str, folder: Path) -> tuple[Path, ...]:
@@ -103,7 +103,7 @@ def write_package(name: str, slot: str, folder: Path) -> tuple[Path, ...]:
 
 def _contents(name: str, module: str, slot: str) -> dict[str, str]:
     """Return path below the folder -> text."""
-    kind = "".join(part.capitalize() for part in name.split("-"))
+    kind = "".join(word.capitalize() for word in name.split("-"))
     member = module if slot == COMMANDS else kind
     example, model = examples()[slot]
     source = example.read_text(encoding="utf-8")
@@ -140,11 +140,11 @@ def _check(name: str, module: str, slot: str) -> None:
         )
     taken = entries(slot).get(name)
     if taken is not None or find_spec(module) is not None:
-        found = taken.origin if taken else f"an installed package {module}"
+        holder = taken.origin if taken else f"an installed package {module}"
         raise UserError(
             f"an installed plugin already uses the name {name}",
             where="NAME",
-            found=found,
+            found=holder,
             todo="choose another name",
         )
 
@@ -154,7 +154,7 @@ def _check_empty(folder: Path) -> None:
         raise UserError(
             "the output folder already contains files",
             where=folder,
-            found=listed(sorted(each.name for each in folder.iterdir())[:5])
+            found=listed(sorted(path.name for path in folder.iterdir())[:5])
             if folder.is_dir()
             else "a file",
             todo="choose another name, or another folder with --out",

@@ -87,8 +87,8 @@ def _rates(
     """Return the share [Q] of negative pairs between edges [Q + 1]; NaN for an empty bin."""
     bins = len(edges) - 1
     places = np.clip(np.searchsorted(edges, apart, side="right") - 1, 0, bins - 1)
-    inside = [negative[places == place] for place in range(bins)]
-    return np.array([float(each.mean()) if len(each) else np.nan for each in inside])
+    inside = [negative[places == bin_index] for bin_index in range(bins)]
+    return np.array([float(pairs.mean()) if len(pairs) else np.nan for pairs in inside])
 
 
 def _pair_ranks(logs: NDArray[np.float64]) -> NDArray[np.float64]:

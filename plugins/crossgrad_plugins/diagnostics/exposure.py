@@ -58,13 +58,13 @@ def exposure_of(scene: Scene) -> SceneExposure:
 
 
 def _rows(scene: Scene, gains: TrackGains) -> list[Row]:
-    told = exposure_values(scene)
-    known = zip(scene.views, gains.gains, gains.known, strict=True)
-    of_tracks = {view.name: float(gain) for view, gain, is_known in known if is_known}
+    of_exif = exposure_values(scene)
+    photo_gains = zip(scene.views, gains.gains, gains.known, strict=True)
+    of_tracks = {view.name: float(gain) for view, gain, is_known in photo_gains if is_known}
     # EXIF data give only differences, so their values are shifted to the tracks if photos have
     # both.
-    both = [of_tracks[name] - value for name, value in told.items() if name in of_tracks]
-    shift = median(both) if both else -sum(told.values()) / max(1, len(told))
+    both = [of_tracks[name] - value for name, value in of_exif.items() if name in of_tracks]
+    shift = median(both) if both else -sum(of_exif.values()) / max(1, len(of_exif))
     trained = frozenset(scene.train)
     return [
         {
@@ -73,7 +73,7 @@ def _rows(scene: Scene, gains: TrackGains) -> list[Row]:
             "part": "train" if index in trained else "test",
             "observations": int(gains.counts[index]),
             "gain_stops": of_tracks.get(view.name, nan),
-            "exif_stops": told[view.name] + shift if view.name in told else nan,
+            "exif_stops": of_exif[view.name] + shift if view.name in of_exif else nan,
         }
         for index, view in enumerate(scene.views)
     ]

@@ -72,9 +72,9 @@ def _trajectory(axes: "Axes", probes: Sequence[Row], column: str, label: str) ->
     rows = rows_of(probes, "plain")
     singles = [b for b in _blocks(rows) if b not in {ALL, "+".join(AMPLITUDES)}]
     for number, block in enumerate(singles):
-        own = [row for row in rows if row["block"] == block]
-        steps = [float(row["step"]) for row in own]
-        values = [float(row[column]) for row in own]
+        block_rows = [row for row in rows if row["block"] == block]
+        steps = [float(row["step"]) for row in block_rows]
+        values = [float(row[column]) for row in block_rows]
         color = _COLORS[number % len(_COLORS)]
         axes.plot(steps, values, marker="o", markersize=4, color=color, label=block)
     axes.set_xlabel("step")
@@ -86,12 +86,12 @@ def _intervals(axes: "Axes", rows: Sequence[Row], column: str, label: str) -> No
     """Draw a point with its interval for each block, side by side for the metrics."""
     blocks = _blocks(rows)
     for shift, (metric, (marker, color)) in zip((-0.12, 0.12), _METRICS.items(), strict=True):
-        own = {str(row["block"]): row for row in rows_of(rows, metric)}
-        if not own:
+        by_block = {str(row["block"]): row for row in rows_of(rows, metric)}
+        if not by_block:
             continue
         places = np.arange(len(blocks)) + shift
         values, low, high = (
-            np.array([float(own[block][column + end]) for block in blocks])
+            np.array([float(by_block[block][column + end]) for block in blocks])
             for end in ("", "_low", "_high")
         )
         axes.vlines(places, low, _drawable(high, low), color=color, linewidth=1.5)
@@ -161,18 +161,18 @@ def _draw_gains(axes: "Axes", exposure: SceneExposure) -> None:
     """Draw a bar for each photo, held-out photos hatched, and EXIF values as markers."""
     rows = exposure.rows
     places = np.arange(len(rows))
-    gains, told = (np.array([float(r[k]) for r in rows]) for k in ("gain_stops", "exif_stops"))
+    gains, exif = (np.array([float(r[k]) for r in rows]) for k in ("gain_stops", "exif_stops"))
     regimes = np.array([str(row["regime"]) for row in rows])
     for number, regime in enumerate(sorted(set(regimes))):
-        own = regimes == regime
+        in_regime = regimes == regime
         color = _EXPOSURE_COLORS[number % len(_EXPOSURE_COLORS)]
-        axes.bar(places[own], np.nan_to_num(gains[own]), 0.8, color=color, label=regime)
+        axes.bar(places[in_regime], np.nan_to_num(gains[in_regime]), 0.8, color=color, label=regime)
     held_out = np.array([row["part"] == "test" for row in rows])
     if held_out.any():
         heights = np.nan_to_num(gains[held_out])
         axes.bar(places[held_out], heights, 0.8, fill=False, hatch="///", label="held out")
-    if not np.isnan(told).all():
-        axes.plot(places, told, "D", color=_BLACK, markersize=4, label="EXIF")
+    if not np.isnan(exif).all():
+        axes.plot(places, exif, "D", color=_BLACK, markersize=4, label="EXIF")
     axes.axhline(0.0, color="0.4", linewidth=0.8)
     axes.set_ylabel("stops above the mean")
     if len(rows) <= _MOST_NAMES:
@@ -187,8 +187,8 @@ def _draw_rule(axes: "Axes", exposure: SceneExposure) -> None:
     values = (exposure.spread, exposure.before, exposure.after)
     limits = (LEAST_SPREAD, np.nan, (1.0 - LEAST_REDUCTION) * exposure.before)
     axes.bar(range(3), values, 0.6, color=(_EXPOSURE_COLORS[0], "0.6", _EXPOSURE_COLORS[2]))
-    for place, limit in enumerate(limits):
-        axes.plot([place - 0.4, place + 0.4], [limit, limit], color=_BLACK, linewidth=1.5)
+    for position, limit in enumerate(limits):
+        axes.plot([position - 0.4, position + 0.4], [limit, limit], color=_BLACK, linewidth=1.5)
     names = ("gains\n(above the line)", "observations", "gains removed\n(below the line)")
     axes.set_xticks(range(3), names, fontsize=7)
     axes.set_ylabel("deviation, stops")

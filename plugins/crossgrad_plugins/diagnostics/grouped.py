@@ -102,8 +102,10 @@ class GroupedGramian:
         difference = np.concatenate([np.full(n, 1.0 / n), np.full(m, -1.0 / m)])
         # Leave the view out of the mean: otherwise its length would correlate with its position
         # along the gap.
-        own = np.diag(deviations) / np.concatenate([np.full(n, n - 1.0), np.full(m, 1.0 - m)])
-        along = centring @ (ordered @ difference - own)
+        self_terms = np.diag(deviations) / np.concatenate(
+            [np.full(n, n - 1.0), np.full(m, 1.0 - m)]
+        )
+        along = centring @ (ordered @ difference - self_terms)
         return cls(
             scale=scale,
             near=deviations[:n, :n],

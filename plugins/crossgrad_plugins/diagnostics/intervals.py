@@ -175,8 +175,8 @@ def _variance_without_gap(parts: GroupedGramian, groups: Groups) -> float:
     near = max(_squared_covariance(parts.near), 0.0)
     far = max(_squared_covariance(parts.far), 0.0)
     meeting = float((parts.cross**2).sum()) / ((n - 1) * (m - 1))
-    own = f**2 * near / (n * (n - 1)) + g**2 * far / (m * (m - 1))
-    return 2.0 * own + 4.0 * f * g * meeting / (n * m)
+    within = f**2 * near / (n * (n - 1)) + g**2 * far / (m * (m - 1))
+    return 2.0 * within + 4.0 * f * g * meeting / (n * m)
 
 
 def _squared_covariance(deviations: NDArray[np.float64]) -> float:

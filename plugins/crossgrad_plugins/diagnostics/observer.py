@@ -50,10 +50,10 @@ class Diagnostics(Observer):
         if self._watch is None:
             self._watch = self._start(model)
         watch = self._watch
-        found = len(watch.rows)
+        rows_before = len(watch.rows)
         watch.crossgrad_model_ready(model)
         folder = self._folder()
-        if folder is not None and len(watch.rows) > found:
+        if folder is not None and len(watch.rows) > rows_before:
             from crossgrad_core.commands import write_table
             from crossgrad_plugins.diagnostics.report import PROBES
 

@@ -96,7 +96,7 @@ def plan_probe(
     rng = np.random.default_rng(seed)
     views: list[int] = []
     for label in (near_label, far_label):
-        members = [i for i, own in enumerate(labels) if own == label]
+        members = [i for i, view_label in enumerate(labels) if view_label == label]
         if len(members) < SMALLEST_GROUP:
             raise UserError(
                 "a probe needs at least two training views in each group",
@@ -123,7 +123,9 @@ def _outermost(scene: Scene, labels: tuple[str, ...]) -> tuple[str, str]:
         return "near", "far"
     closeness = _closeness(scene)
     mean = {
-        name: float(np.median([c for c, own in zip(closeness, labels, strict=True) if own == name]))
+        name: float(
+            np.median([c for c, label in zip(closeness, labels, strict=True) if label == name])
+        )
         for name in names
     }
     return max(names, key=lambda name: mean[name]), min(names, key=lambda name: mean[name])

@@ -65,8 +65,8 @@ def measure(model: Model, views: Sequence[int], rng: np.random.Generator) -> Mea
     names = [name for block in blocks for name in block.tensors]
     train_views = model.scene.train_views
     gradients = [factors.of(view_gradients(model, train_views[view], names)) for view in views]
-    finite = [all(bool(torch.isfinite(g).all()) for g in each.values()) for each in gradients]
-    kept = [each for each, good in zip(gradients, finite, strict=True) if good]
+    finite = [all(bool(torch.isfinite(g).all()) for g in tensors.values()) for tensors in gradients]
+    kept = [tensors for tensors, good in zip(gradients, finite, strict=True) if good]
     dense = gathered(kept, blocks)
     plain, overlap = dense.gramians("block"), dense.overlap("block")
     adam = None
@@ -164,15 +164,15 @@ def _divide_by_adam(model: Model, subset: _Subset, gradients: Sequence[_Gradient
     """
     beta2 = model.rule.betas[1]
     for name, moment in model.adam.exp_avg_sq.items():
-        having = [each for each in gradients if name in each]
+        having = [tensors for tensors in gradients if name in tensors]
         if not having:
             continue
         mean = torch.zeros_like(having[0][name])
-        for each in having:
-            mean.addcmul_(each[name], each[name], value=1.0 / len(gradients))
+        for tensors in having:
+            mean.addcmul_(tensors[name], tensors[name], value=1.0 / len(gradients))
         lengthened = 1.0 / subset.share if name in subset.tensors else 1.0
         second = beta2 * subset.plain(name, moment) + (1.0 - beta2) * mean / lengthened
         correction = 1.0 - beta2 ** ((model.adam.steps[name] + 1) * model.rule.age)
         root = (second / correction).sqrt_().add_(model.rule.eps)
-        for each in having:
-            each[name] = each[name] / root
+        for tensors in having:
+            tensors[name] = tensors[name] / root

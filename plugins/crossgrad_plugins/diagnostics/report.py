@@ -79,7 +79,7 @@ class Report:
             self._blocks(),
             _grouping_lines(self.groupings),
         )
-        return [line for part in parts if part for line in ("", *part)][1:]
+        return [line for section in parts if section for line in ("", *section)][1:]
 
     def _blocks(self) -> list[str]:
         last = max(int(row["step"]) for row in self.probes)

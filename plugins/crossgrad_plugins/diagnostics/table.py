@@ -78,8 +78,8 @@ def _share(part: NDArray[np.int64], whole: NDArray[np.int64]) -> NDArray[np.floa
 
 def _mean(values: NDArray[np.float64]) -> float:
     """Return the mean of the values that are not NaN; NaN if all values are NaN."""
-    known = values[~np.isnan(values)]
-    return float(known.mean()) if len(known) else float("nan")
+    valid = values[~np.isnan(values)]
+    return float(valid.mean()) if len(valid) else float("nan")
 
 
 #: Minimum number of views to fit a line and the scatter around it.
@@ -163,8 +163,8 @@ def _squared_mean(gramian: NDArray[np.float64], groups: Groups) -> float:
         (near, n, p, groups.unseen[0]),
         (~near, m, q, groups.unseen[1]),
     ):
-        own = gramian[np.ix_(members, members)]
-        spread = (float(np.trace(own)) - float(own.sum()) / size) / (size - 1)
+        group_gramian = gramian[np.ix_(members, members)]
+        spread = (float(np.trace(group_gramian)) - float(group_gramian.sum()) / size) / (size - 1)
         noise += share**2 * unseen * spread / size
     return plain - noise
 
@@ -230,8 +230,8 @@ def table(
 def _parts(measurement: Measurement) -> Iterator[_Part]:
     """Yield every block, the amplitudes concatenated, and all blocks concatenated."""
     blocks = measurement.blocks
-    for place, (name, kind) in enumerate(zip(blocks, measurement.kinds, strict=True)):
-        yield _Part(name, kind, (place,))
+    for index, (name, kind) in enumerate(zip(blocks, measurement.kinds, strict=True)):
+        yield _Part(name, kind, (index,))
     if set(AMPLITUDES) <= set(blocks):
         members = tuple(blocks.index(name) for name in AMPLITUDES)
         yield _Part("+".join(AMPLITUDES), "appearance", members)
@@ -251,7 +251,7 @@ def _block(
     overlap: NDArray[np.bool_] = np.any(measurement.overlap[list(part.members)], axis=0)
     clashes = conflict(total[None], near, overlap[None])
     ratio = gradient_ratio(np.diag(total), near)
-    each = tuple(gradient_ratio(np.diag(gramian), near).of_means for gramian in gramians)
+    ratios = tuple(gradient_ratio(np.diag(gramian), near).of_means for gramian in gramians)
     groups = Groups(near)
     split = variance_split(total, groups)
     exact = variance_split(total, Groups(near, cameras=plan.cameras))
@@ -265,7 +265,7 @@ def _block(
         "zero_pairs": int(clashes.zero[0]),
         "ratio_of_means": ratio.of_means,
         "ratio_median": ratio.median,
-        "ratio_geometric": geometric_mean(each),
+        "ratio_geometric": geometric_mean(ratios),
         "sigma_w2": split.within,
         **_ends("sigma_w2", intervals.within),
         "sigma_b2": split.between,
@@ -289,10 +289,10 @@ def _distances(
         fit = distance_exponent(np.diag(gramian), values)
         row[f"exponent_{name}"] = fit.value
         row |= _ends(f"exponent_{name}", fit.interval)
-        found = conflict_by_distance(gramian, values, rng)
-        row[f"conflict_correlation_{name}"] = found.correlation
-        row[f"conflict_p_{name}"] = found.p_value
-        row |= {f"conflict_{name}_bin{b + 1}": float(r) for b, r in enumerate(found.rates)}
+        by_distance = conflict_by_distance(gramian, values, rng)
+        row[f"conflict_correlation_{name}"] = by_distance.correlation
+        row[f"conflict_p_{name}"] = by_distance.p_value
+        row |= {f"conflict_{name}_bin{b + 1}": float(r) for b, r in enumerate(by_distance.rates)}
     return row
 
 

@@ -41,11 +41,11 @@ def distances_of(scene: Scene) -> dict[str, NDArray[np.float64]]:
     points divided by the focal length, relative to the median view; only if every view sees points.
     """
     views = scene.train_views
-    found = {"radial": radial_distances(scene, views)}
+    distances = {"radial": radial_distances(scene, views)}
     footprints = np.array([footprint_of(scene, view) for view in views])
     if not np.isnan(footprints).any():
-        found["depth"] = np.median(footprints) / footprints
-    return found
+        distances["depth"] = np.median(footprints) / footprints
+    return distances
 
 
 def camera_rows(scene: Scene) -> list[Row]:
@@ -83,11 +83,11 @@ def grouping_rows(scene: Scene, measurement: Measurement, seed: int) -> list[Row
             continue
         plan = plan_probe(scene, name, labels, len(labels), seed)
         places = [
-            place
-            for place, view in enumerate(measurement.views)
+            position
+            for position, view in enumerate(measurement.views)
             if labels[view] in {plan.near_label, plan.far_label}
         ]
-        near = plan.near([measurement.views[place] for place in places])
+        near = plan.near([measurement.views[position] for position in places])
         probed = min(int(near.sum()), int((~near).sum()))
         if probed < SMALLEST_GROUP:
             rows.append({"grouping": name, "note": "one of its groups has too few probed views"})
@@ -115,7 +115,7 @@ def _part(measurement: Measurement, places: list[int]) -> Measurement:
     square = np.ix_(range(len(measurement.blocks)), places, places)
     return Measurement(
         step=measurement.step,
-        views=tuple(measurement.views[place] for place in places),
+        views=tuple(measurement.views[position] for position in places),
         blocks=measurement.blocks,
         kinds=measurement.kinds,
         plain=measurement.plain[square],
@@ -180,9 +180,9 @@ class Watch:
             return
         start = perf_counter()
         self.last = measure(model, self.plan.views, np.random.default_rng(self.seed))
-        found = table(self.last, self.plan, distances_of(model.scene), self.seed)
+        rows = table(self.last, self.plan, distances_of(model.scene), self.seed)
         seconds = round(perf_counter() - start, 3)
-        self.rows += [{**row, "probe_seconds": seconds} for row in found]
+        self.rows += [{**row, "probe_seconds": seconds} for row in rows]
 
     def report(self, scene: Scene, which: str) -> Report:
         """Return the complete report.

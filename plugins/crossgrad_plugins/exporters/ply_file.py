@@ -196,18 +196,18 @@ def _representable(cloud: SplatCloud) -> NDArray[np.bool_]:
     return valid
 
 
-def _rows(cloud: SplatCloud, part: slice) -> NDArray[np.float32]:
+def _rows(cloud: SplatCloud, rows: slice) -> NDArray[np.float32]:
     """Return [n, 62] little-endian rows of the table."""
-    means = cloud.means[part]
+    means = cloud.means[rows]
     count = len(means)
     columns = (
         means,
         np.zeros((count, 3)),
-        cloud.sh_dc[part],
-        cloud.sh_rest[part].transpose(0, 2, 1).reshape(count, 3 * REST),
-        cloud.logit_opacities[part, None],
-        cloud.log_scales[part],
-        cloud.quats[part],
+        cloud.sh_dc[rows],
+        cloud.sh_rest[rows].transpose(0, 2, 1).reshape(count, 3 * REST),
+        cloud.logit_opacities[rows, None],
+        cloud.log_scales[rows],
+        cloud.quats[rows],
     )
     return np.concatenate([column.astype("<f4") for column in columns], axis=1)
 
@@ -311,13 +311,13 @@ def _offset(comments: Sequence[str], path: Path) -> NDArray[np.float64]:
 
 
 def _check_coordinates(comments: Sequence[str], path: Path) -> None:
-    found = _tagged(comments, COORDINATES_TAG)
-    if found is not None:
+    coordinates = _tagged(comments, COORDINATES_TAG)
+    if coordinates is not None:
         raise UserError(
             "the PLY file uses other coordinates than the scene",
             where=path,
             expected="the coordinates of the scene's input files",
-            found=found,
+            found=coordinates,
             todo="export the file again with --coordinates input",
         )
 

@@ -72,10 +72,10 @@ _KNOWN: "WeakKeyDictionary[Scene, Mapping[str, float]]" = WeakKeyDictionary()
 
 def exposure_values(scene: Scene) -> Mapping[str, float]:
     """Return name -> log2(t ISO / N^2) of all photos with EXIF exposure; read once per scene."""
-    found = _KNOWN.get(scene)
-    if found is None:
+    by_name = _KNOWN.get(scene)
+    if by_name is None:
         with ThreadPoolExecutor(_AT_ONCE) as pool:
             values = list(pool.map(exposure_value, scene.views))
-        told = zip(scene.views, values, strict=True)
-        found = _KNOWN[scene] = {view.name: value for view, value in told if value is not None}
-    return found
+        pairs = zip(scene.views, values, strict=True)
+        by_name = _KNOWN[scene] = {view.name: value for view, value in pairs if value is not None}
+    return by_name

@@ -62,15 +62,15 @@ def starts_of(scene: Scene, start: Start) -> Starts:
             ("exposure: there is only one training photo, so there are no differences",),
         )
     tracks = training_gains(scene) if start in {"auto", "tracks"} else None
-    told = exposure_values(scene) if start in {"auto", "exif"} else {}
+    exif_stops = exposure_values(scene) if start in {"auto", "exif"} else {}
     of_tracks: dict[str, float] = {}
     if tracks is not None:
-        known = zip(names, tracks.gains, tracks.known, strict=True)
-        of_tracks = {name: float(gain) for name, gain, is_known in known if is_known}
-    of_exif = _beside({name: told[name] for name in names if name in told}, of_tracks)
-    found = {**of_exif, **of_tracks}
-    rest = [name for name in names if name not in found]
-    stops, by = _filled(np.array([found.get(name, np.nan) for name in names]), scene.train_views)
+        photo_gains = zip(names, tracks.gains, tracks.known, strict=True)
+        of_tracks = {name: float(gain) for name, gain, is_known in photo_gains if is_known}
+    of_exif = _beside({name: exif_stops[name] for name in names if name in exif_stops}, of_tracks)
+    by_name = {**of_exif, **of_tracks}
+    rest = [name for name in names if name not in by_name]
+    stops, by = _filled(np.array([by_name.get(name, np.nan) for name in names]), scene.train_views)
     stops -= stops.mean()
     messages = [] if tracks is None else [f"exposure: {tracks.evidence}"]
     messages += _reported_by("EXIF", [name for name in of_exif if name not in of_tracks])
@@ -88,32 +88,32 @@ def starts_of(scene: Scene, start: Start) -> Starts:
     return Starts(stops, tuple(messages))
 
 
-def _beside(told: dict[str, float], of_tracks: dict[str, float]) -> dict[str, float]:
+def _beside(exif_stops: dict[str, float], of_tracks: dict[str, float]) -> dict[str, float]:
     """Shift EXIF's stops to the scale of the tracks; without common photos, to a mean of 0."""
-    if not told:
+    if not exif_stops:
         return {}
-    both = [of_tracks[name] - value for name, value in told.items() if name in of_tracks]
-    shift = median(both) if both else -fmean(told.values())
-    return {name: value + shift for name, value in told.items()}
+    both = [of_tracks[name] - value for name, value in exif_stops.items() if name in of_tracks]
+    shift = median(both) if both else -fmean(exif_stops.values())
+    return {name: value + shift for name, value in exif_stops.items()}
 
 
 def _filled(stops: NDArray[np.float64], views: Sequence[View]) -> tuple[NDArray[np.float64], str]:
     """Replace NaN by predictions of neighbours or regimes; return the source, too."""
-    known = np.flatnonzero(~np.isnan(stops)).tolist()
+    known_rows = np.flatnonzero(~np.isnan(stops)).tolist()
     of_regime = "the mean of their regime"
-    if not len(known):
+    if not len(known_rows):
         return np.zeros_like(stops), of_regime
     filled = stops.copy()
     missing = np.flatnonzero(np.isnan(stops)).tolist()
-    neighbours, told = Neighbours([views[row] for row in known]), stops[known]
-    if neighbours.tell(told[:, None]):
+    neighbours, known_stops = Neighbours([views[row] for row in known_rows]), stops[known_rows]
+    if neighbours.tell(known_stops[:, None]):
         for row in missing:
             rows, weights = neighbours.rows_and_weights(views[row].camera)
-            filled[row] = weights @ told[rows]
+            filled[row] = weights @ known_stops[rows]
         return filled, "the photos with the nearest poses"
     for row in missing:
-        own = [each for each in known if views[each].regime == views[row].regime]
-        filled[row] = stops[own or known].mean()
+        in_regime = [other for other in known_rows if views[other].regime == views[row].regime]
+        filled[row] = stops[in_regime or known_rows].mean()
     return filled, of_regime
 
 
@@ -175,8 +175,10 @@ class Neighbours:
         """
         rows, weights = self._others
         near = (weights[..., None] * values[rows]).sum(axis=1)
-        told = (near, self._means(values))
-        of_near, of_regime = (float(np.sqrt(np.square(each - values).mean())) for each in told)
+        predictions = (near, self._means(values))
+        of_near, of_regime = (
+            float(np.sqrt(np.square(prediction - values).mean())) for prediction in predictions
+        )
         return of_near, of_regime
 
     def tell(self, values: _Floats) -> bool:
@@ -226,7 +228,7 @@ class Neighbours:
 
 def neighbours_of(scene: Scene) -> Neighbours:
     """Return the neighbours among the training photos of a scene; computed once per scene."""
-    found = _KNOWN.get(scene)
-    if found is None:
-        found = _KNOWN[scene] = Neighbours(scene.train_views)
-    return found
+    neighbours = _KNOWN.get(scene)
+    if neighbours is None:
+        neighbours = _KNOWN[scene] = Neighbours(scene.train_views)
+    return neighbours

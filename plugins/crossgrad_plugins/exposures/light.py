@@ -38,7 +38,7 @@ def mapped(image: Tensor, matrix: Tensor) -> Tensor:
 
 
 def _is_compiled(*tensors: Tensor) -> bool:
-    return all(each.device.type == "cpu" and each.dtype == torch.float32 for each in tensors)
+    return all(tensor.device.type == "cpu" and tensor.dtype == torch.float32 for tensor in tensors)
 
 
 class _Gain(torch.autograd.Function):

@@ -71,7 +71,7 @@ class ExposurePerPhoto(Exposure):
 
     @override
     def project(self, values: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-        return {name: self._centred(each.double()) for name, each in values.items()}
+        return {name: self._centred(value.double()) for name, value in values.items()}
 
     def _centred(self, values: Tensor) -> Tensor:
         """Shift the values [P, V], in float64, to a neutral mean; return them in float32."""
@@ -87,21 +87,21 @@ class ExposurePerPhoto(Exposure):
         Neighbours are the training photos nearest in pose. The neighbours are used if they predict
         each other better than the mean over a regime does.
         """
-        told = exposure_values(scene)
-        own = values[self.parameter]
-        rows = [row for row, each in enumerate(scene.train_views) if each.name in told]
-        if view.name in told and rows:
+        exif = exposure_values(scene)
+        trained = values[self.parameter]
+        rows = [row for row, photo in enumerate(scene.train_views) if photo.name in exif]
+        if view.name in exif and rows:
             # Sensors differ, and a regime often has its own sensor.
             rows = [row for row in rows if scene.train_views[row].regime == view.regime] or rows
-            stops = [told[view.name] - told[scene.train_views[row].name] for row in rows]
-            shift = self.beside(own[rows], torch.tensor(stops).to(own))
+            stops = [exif[view.name] - exif[scene.train_views[row].name] for row in rows]
+            shift = self.beside(trained[rows], torch.tensor(stops).to(trained))
             return {self.parameter: shift.mean(dim=0)}
         neighbours = neighbours_of(scene)
-        if not neighbours.tell(own.detach().cpu().double().reshape(len(own), -1).numpy()):
+        if not neighbours.tell(trained.detach().cpu().double().reshape(len(trained), -1).numpy()):
             return super().predict_unseen(view, scene, values)
         near, weights = neighbours.rows_and_weights(view.camera)
-        shares = torch.from_numpy(weights).to(own)
-        return {self.parameter: torch.tensordot(shares, own[torch.from_numpy(near)], dims=1)}
+        shares = torch.from_numpy(weights).to(trained)
+        return {self.parameter: torch.tensordot(shares, trained[torch.from_numpy(near)], dims=1)}
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
         """Report `decay` as unused if the rate is 0."""

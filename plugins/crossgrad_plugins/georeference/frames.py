@@ -149,9 +149,9 @@ def _agreeing(points: NDArray[np.float64], measured: NDArray[np.float64]) -> NDA
     rng = np.random.default_rng(0)
     triples = np.argsort(rng.random((_TRIPLES, len(points))), axis=1)[:, :FEWEST]
     rotations, shifts, scales = _fitted(points[triples], measured[triples])
-    some = slice(None, None, -(-len(points) // _MOST_TRIED))
-    fitted = scales[:, None, None] * (points[some] @ rotations.transpose(0, 2, 1))
-    tried = np.linalg.norm(measured[some] - fitted - shifts[:, None], axis=2)  # [S, n]
+    subset = slice(None, None, -(-len(points) // _MOST_TRIED))
+    fitted = scales[:, None, None] * (points[subset] @ rotations.transpose(0, 2, 1))
+    tried = np.linalg.norm(measured[subset] - fitted - shifts[:, None], axis=2)  # [S, n]
     medians = np.median(tried, axis=1)
     best = int(np.argmin(medians))
     frame = Frame3D(rotations[best], shifts[best], float(scales[best]))
@@ -187,7 +187,7 @@ def _fitted(
     signs[:, 2] = np.sign(np.linalg.det(left @ right))
     rotations = (left * signs[:, None]) @ right
     spread = (source**2).sum(axis=(1, 2))
-    known = np.where(spread > 0.0, spread, 1.0)
-    scales = (sizes * signs).sum(axis=1) / known
+    divisor = np.where(spread > 0.0, spread, 1.0)
+    scales = (sizes * signs).sum(axis=1) / divisor
     shifts = aim - scales[:, None] * np.einsum("sij,sj->si", rotations, middle)
     return rotations, shifts, scales

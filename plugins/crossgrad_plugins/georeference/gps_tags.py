@@ -39,7 +39,7 @@ def _degrees(side: object, value: object) -> float:
     """Convert degrees, minutes, seconds to degrees; negative in south and west, NaN if invalid."""
     if not isinstance(value, tuple) or not 1 <= len(value) <= len(_STEPS):
         return math.nan
-    degrees = sum(number(part) / step for part, step in zip(value, _STEPS, strict=False))
+    degrees = sum(number(component) / step for component, step in zip(value, _STEPS, strict=False))
     return -degrees if str(side).strip("\0 ").upper() in _SOUTH_OR_WEST else degrees
 
 

@@ -51,9 +51,11 @@ def _harmonics_turn(rotation: Tensor, degree: int) -> Tensor:
     orthogonal matrix for each band. The matrix is fitted to their values in enough directions.
     """
     directions = _directions()
-    before, after = (harmonics(each, degree)[:, 1:] for each in (directions, directions @ rotation))
-    found: Tensor = torch.linalg.lstsq(before, after).solution
-    return found
+    before, after = (
+        harmonics(vectors, degree)[:, 1:] for vectors in (directions, directions @ rotation)
+    )
+    matrix: Tensor = torch.linalg.lstsq(before, after).solution
+    return matrix
 
 
 @cache
@@ -98,10 +100,10 @@ class OnEarth:
     def note(self) -> str:
         """One sentence for the user; see `crossgrad_core.plugin.Georeference`."""
         parts = [f"{name.replace('_', ' ')} {m:.2f} m" for name, m in self.residuals.items()]
-        told = f"; residuals: {', '.join(parts)}" if parts else ""
+        residual_text = f"; residuals: {', '.join(parts)}" if parts else ""
         return (
             f"georeferenced by {self.source}: origin at {self.origin.text}, 1 unit = "
-            f"{self.to_enu.scale:.6g} m{told}"
+            f"{self.to_enu.scale:.6g} m{residual_text}"
         )
 
     def placed(self, gaussians: Gaussians, similarity: Similarity, coordinates: str) -> Placed:
@@ -115,8 +117,8 @@ class OnEarth:
             facts |= self.system.facts if self.system is not None else {}
             return Placed(gaussians, similarity, {**facts, **self._ways(SAME)})
         if coordinates == LOCAL:
-            own = Frame3D(np.eye(3), -similarity.scale * similarity.offset, similarity.scale)
-            return Placed(gaussians, Similarity(np.zeros(3), 1.0), {**facts, **self._ways(own)})
+            local = Frame3D(np.eye(3), -similarity.scale * similarity.offset, similarity.scale)
+            return Placed(gaussians, Similarity(np.zeros(3), 1.0), {**facts, **self._ways(local)})
         if coordinates == "enu":
             return self._turned(gaussians, similarity, self.to_enu, here, facts)
         where, code = f"--coordinates {coordinates}", coordinates
@@ -150,10 +152,10 @@ class OnEarth:
         same size, so that an exporter only moves and scales them.
         """
         offset = frame.points(similarity.offset[None])[0]
-        own = Similarity(offset, similarity.scale / frame.scale)
-        means = torch.from_numpy(own.to_local(points)).to(gaussians.means.device)
+        frame_similarity = Similarity(offset, similarity.scale / frame.scale)
+        means = torch.from_numpy(frame_similarity.to_local(points)).to(gaussians.means.device)
         moved = turned(gaussians, means, torch.from_numpy(frame.rotation))
-        return Placed(moved, own, {**facts, **self._ways(frame)})
+        return Placed(moved, frame_similarity, {**facts, **self._ways(frame)})
 
     def _facts(self) -> dict[str, Json]:
         """Return the facts that hold in any coordinates."""

@@ -96,8 +96,8 @@ class Projection:
 
     def geocentric(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert points [N, 3] to geocentric coordinates [N, 3]; NaN if undefined."""
-        found = np.column_stack(self.forward.transform(*points.T, direction="INVERSE"))
-        return np.where(np.isfinite(found), found, np.nan)
+        converted = np.column_stack(self.forward.transform(*points.T, direction="INVERSE"))
+        return np.where(np.isfinite(converted), converted, np.nan)
 
     def near(self, to_enu: Frame3D, place: NDArray[np.float64], where: str) -> Frame3D:
         """Fit the similarity from east, north, up to this system around a place.
@@ -127,21 +127,21 @@ class Projection:
         scale = float(np.cbrt(sizes.prod()))
         return Frame3D(rotation, here - scale * rotation @ place, scale)
 
-    def _unusable(self, where: str, found: str) -> UserError:
+    def _unusable(self, where: str, reason: str) -> UserError:
         return UserError(
             f"Gaussians cannot be exported in {self.code}",
             where=where,
             expected="a right-handed system with the same unit on all axes",
-            found=found,
+            found=reason,
             todo="use UTM (--coordinates utm) or enu",
         )
 
 
-def _unknown(where: str, found: str) -> UserError:
+def _unknown(where: str, reason: str) -> UserError:
     return UserError(
         "PROJ cannot convert to these coordinates",
         where=where,
-        found=found,
+        found=reason,
         todo="check the code, or use a code of WGS 84 or ETRS89 without a height system, "
         "such as epsg:32633 or epsg:25833",
     )

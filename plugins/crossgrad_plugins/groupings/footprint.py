@@ -49,8 +49,8 @@ class Footprint(Grouping):
         self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
     ) -> GroupingRule:
         require_training_views(scene, "footprint")
-        own = _own(scene, scene.train_views)
-        blind = np.isnan(own)
+        footprints = _own(scene, scene.train_views)
+        blind = np.isnan(footprints)
         if blind.all():
             raise UserError(
                 "grouping footprint needs SfM points that are visible in photos",
@@ -58,11 +58,11 @@ class Footprint(Grouping):
                 found="no SfM point is visible in a training photo",
                 todo="choose grouping radial, which needs only camera positions",
             )
-        known, places = own[~blind], scene.centers[~blind]
+        known_footprints, places = footprints[~blind], scene.centers[~blind]
 
         def sizes(views: Sequence[View]) -> NDArray[np.float64]:
             """Return [V] negative footprints; small values are near, as `halves` requires."""
-            return -_filled(_own(scene, views), views, known, places)
+            return -_filled(_own(scene, views), views, known_footprints, places)
 
         train = sizes(scene.train_views)
         threshold = -cut_of(-train, self.cut)
@@ -86,14 +86,14 @@ def _own(scene: Scene, views: Sequence[View]) -> NDArray[np.float64]:
 
 
 def _filled(
-    found: NDArray[np.float64],
+    footprints: NDArray[np.float64],
     views: Sequence[View],
-    known: NDArray[np.float64],
+    known_footprints: NDArray[np.float64],
     places: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Return [V] footprints; NaN becomes the value of the nearest camera at `places` [N, 3]."""
-    for place, view in enumerate(views):
-        if np.isnan(found[place]):
+    for row, view in enumerate(views):
+        if np.isnan(footprints[row]):
             ways = np.linalg.norm(places - centers_of((view,)), axis=1)
-            found[place] = known[ways.argmin()]
-    return found
+            footprints[row] = known_footprints[ways.argmin()]
+    return footprints

@@ -161,5 +161,5 @@ def _cut(ordered: NDArray[np.float64], scores: NDArray[np.float64]) -> float:
     """
     if len(scores) == 0 or scores.max() <= 0.0:
         return float(ordered[-1])
-    place = int(scores.argmax())
-    return float((ordered[place] + ordered[place + 1]) / 2.0)
+    gap = int(scores.argmax())
+    return float((ordered[gap] + ordered[gap + 1]) / 2.0)

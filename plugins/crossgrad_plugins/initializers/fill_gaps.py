@@ -84,14 +84,14 @@ class Filled(Initializer):
 
     @override
     def more_points(self, scene: Scene) -> MorePoints | None:
-        filling, own = self._filling(scene), len(scene.points)
-        added = len(filling.points) - own
+        filling, existing = self._filling(scene), len(scene.points)
+        added = len(filling.points) - existing
         if not added:
             return None
         return MorePoints(
-            positions=filling.points[own:],
+            positions=filling.points[existing:],
             colors=np.concatenate(filling.colors),
-            sizes=filling.sizes[own:],
+            sizes=filling.sizes[existing:],
             opacities=np.full(added, self.opacity),
         )
 
@@ -109,38 +109,38 @@ class Filled(Initializer):
         )
 
     def _filling(self, scene: Scene) -> _Filling:
-        known = _KNOWN.setdefault(scene, {})
-        if self not in known:
-            known[self] = self._filled(scene)
-        return known[self]
+        cached = _KNOWN.setdefault(scene, {})
+        if self not in cached:
+            cached[self] = self._filled(scene)
+        return cached[self]
 
     def _filled(self, scene: Scene) -> _Filling:
         filling = _Filling(scene.points, _spacings(scene.points))
         views, margin = _spread(scene.train_views, self.views), round(self.margin * self.cells)
         if not views:
             return filling
-        some = scene.points[:: -(-len(scene.points) // _POINTS) or 1]
-        sky = Sky(upward(scene)[0], scene.robust_centers, some, _NOT_STRAY)
+        sample = scene.points[:: -(-len(scene.points) // _POINTS) or 1]
+        sky = Sky(upward(scene)[0], scene.robust_centers, sample, _NOT_STRAY)
         deep = {
             view: Depth.of(view.camera, scene.points[view.seen], FEWEST, sky)
             for view in (scene.train_views if margin else views)
         }
-        known = [(view, depth) for view in views if (depth := deep[view]) is not None]
-        filling.left_aside = len(views) - len(known)
+        with_depth = [(view, depth) for view in views if (depth := deep[view]) is not None]
+        filling.left_aside = len(views) - len(with_depth)
         # Fill near photos first, with small Gaussians, so that no large Gaussians are needed behind
         # them.
-        known.sort(key=lambda each: each[1].median)
-        air = _Air.of(known)
-        for view, depth in known:
+        with_depth.sort(key=lambda pair: pair[1].median)
+        air = _Air.of(with_depth)
+        for view, depth in with_depth:
             self._fill(filling, view, depth, air, 0, None)
         filling.inside = len(filling.points) - len(scene.points)
-        if margin and known:
+        if margin and with_depth:
             pictures = _Pictures.of(deep)
             # A camera may be above ground that another photo shows. The other photo then shows, or
             # hides, the surroundings of this camera.
-            centers = np.stack([view.camera.center.numpy() for view, _ in known])
+            centers = np.stack([view.camera.center.numpy() for view, _ in with_depth])
             low = pictures.look_down_on(centers, sky.up)
-            high = [each for each, inside in zip(known, low, strict=True) if not inside]
+            high = [pair for pair, inside in zip(with_depth, low, strict=True) if not inside]
             for view, depth in reversed(high):
                 self._fill(filling, view, depth, air, margin, pictures)
         return filling
@@ -222,9 +222,9 @@ class _Air:
     reach: NDArray[np.float64]
 
     @classmethod
-    def of(cls, known: Sequence[tuple[View, Depth]]) -> "_Air":
-        centers = [view.camera.center.numpy() for view, _ in known]
-        reach = [1.0 / depth.nearest for _, depth in known]
+    def of(cls, with_depth: Sequence[tuple[View, Depth]]) -> "_Air":
+        centers = [view.camera.center.numpy() for view, _ in with_depth]
+        reach = [1.0 / depth.nearest for _, depth in with_depth]
         return cls(np.array(centers).reshape(-1, 3), np.array(reach))
 
     def holds(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -268,8 +268,8 @@ class _Pictures:
         return cls(
             cameras,
             list(depths.values()),
-            np.stack([(each.matrix @ each.world_to_camera[:3]).numpy() for each in cameras]),
-            np.array([[[each.width, each.height]] for each in cameras]),
+            np.stack([(camera.matrix @ camera.world_to_camera[:3]).numpy() for camera in cameras]),
+            np.array([[[camera.width, camera.height]] for camera in cameras]),
             np.array(limits),
         )
 

@@ -91,10 +91,10 @@ class Triangulated(Initializer):
     def more_points(self, scene: Scene) -> MorePoints | None:
         if len(scene.points):
             return None
-        known = _KNOWN.setdefault(scene, {})
-        if self not in known:
-            known[self] = self._found(scene)
-        return known[self]
+        cached = _KNOWN.setdefault(scene, {})
+        if self not in cached:
+            cached[self] = self._found(scene)
+        return cached[self]
 
     @override
     def messages(self, scene: Scene) -> tuple[str, ...]:
@@ -135,13 +135,15 @@ class Triangulated(Initializer):
         photo = view.photo
         image, mask = photo.image().cpu().numpy(), photo.mask()
         grey = np.ascontiguousarray((image @ _GREY).round().astype(np.uint8))
-        pixels, found = _sift(grey, self.features)
+        pixels, descriptors = _sift(grey, self.features)
         across, down = np.floor(pixels).astype(np.int64).clip(0, np.array(grey.shape[::-1]) - 1).T
         counts = np.ones(grey.shape, np.bool_) if mask is None else mask.cpu().numpy()
         rows = np.flatnonzero(counts[down, across])
-        lengths = np.linalg.norm(found[rows], axis=1, keepdims=True)
+        lengths = np.linalg.norm(descriptors[rows], axis=1, keepdims=True)
         colors = image[down[rows], across[rows]]
-        return Features(view.camera, pixels[rows], found[rows] / np.maximum(lengths, 1.0), colors)
+        return Features(
+            view.camera, pixels[rows], descriptors[rows] / np.maximum(lengths, 1.0), colors
+        )
 
 
 def _sift(grey: NDArray[np.uint8], most: int) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
@@ -173,14 +175,14 @@ def _pairs(views: Sequence[View], neighbours: int) -> list[tuple[int, int]]:
     """Return pairs of photos to compare: each photo with its nearest of similar direction."""
     centers = centers_of(views)
     axes = np.stack([view.camera.world_to_camera[2, :3].numpy() for view in views])
-    found: set[tuple[int, int]] = set()
+    pairs: set[tuple[int, int]] = set()
     for i in range(len(views)):
         distances = np.linalg.norm(centers - centers[i], axis=1)
         # Cameras at the same position give no depth.
         distances[(axes @ axes[i] < _ASKEW) | (distances == 0.0)] = np.inf
         near = np.argsort(distances, kind="stable")[:neighbours]
-        found |= {(min(i, j), max(i, j)) for j in near.tolist() if np.isfinite(distances[j])}
-    return sorted(found)
+        pairs |= {(min(i, j), max(i, j)) for j in near.tolist() if np.isfinite(distances[j])}
+    return sorted(pairs)
 
 
 def _best(pairs: Sequence[tuple[int, int]], met: Sequence[Met]) -> list[tuple[int, int]]:
@@ -188,12 +190,12 @@ def _best(pairs: Sequence[tuple[int, int]], met: Sequence[Met]) -> list[tuple[in
 
     Each feature is used once, in the match with the widest angle.
     """
-    angles = np.concatenate([each.angles for each in met]) if met else np.zeros(0)
-    places = [(p, m) for p, each in enumerate(met) for m in range(len(each.points))]
+    angles = np.concatenate([common.angles for common in met]) if met else np.zeros(0)
+    matches = [(p, m) for p, common in enumerate(met) for m in range(len(common.points))]
     used: set[tuple[int, int]] = set()
     kept = []
-    for place in np.argsort(-angles, kind="stable").tolist():
-        p, m = places[place]
+    for index in np.argsort(-angles, kind="stable").tolist():
+        p, m = matches[index]
         ends = {(pairs[p][0], int(met[p].first[m])), (pairs[p][1], int(met[p].second[m]))}
         if not ends & used:
             used |= ends
@@ -211,9 +213,9 @@ def meet(first: Features, second: Features, pixels: float) -> Met:
     at = first.pixels[one], second.pixels[other]
     points = _triangulated(_projection(first.camera), _projection(second.camera), *at)
     good = np.isfinite(points).all(axis=1)
-    for features, found in zip((first, second), at, strict=True):
+    for features, measured in zip((first, second), at, strict=True):
         shown, depth = features.camera.project(points)
-        good &= (depth > 0.0) & (np.linalg.norm(shown - found, axis=1) <= pixels)
+        good &= (depth > 0.0) & (np.linalg.norm(shown - measured, axis=1) <= pixels)
     angles = _angles(first.camera, second.camera, points)
     good &= (angles >= _SMALLEST) & (angles <= _LARGEST)
     return Met(one[good], other[good], points[good], angles[good])
@@ -268,7 +270,7 @@ def _triangulated(
 
 def _angles(first: Camera, second: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return [M] angles at points [M, 3] between the rays to two cameras."""
-    rays = [each.center.numpy() - points for each in (first, second)]
+    rays = [camera.center.numpy() - points for camera in (first, second)]
     with np.errstate(divide="ignore", invalid="ignore"):
         one, other = (ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)
     return np.asarray(np.arccos(np.clip((one * other).sum(axis=1), -1.0, 1.0)))

@@ -56,10 +56,10 @@ def _cells(finding: Finding) -> tuple[str, ...]:
 def _wide(row: Sequence[str], width: int) -> Iterator[str]:
     """Yield the lines of a row in columns, each cell wrapped."""
     rest = width - sum(_WIDTHS) - len(_GAP) * (len(_WIDTHS) - 1)
-    widths = [each or rest for each in _WIDTHS]
+    widths = [column_width or rest for column_width in _WIDTHS]
     cells = [_wrapped(text, space) for text, space in zip(row, widths, strict=True)]
-    for parts in zip_longest(*cells, fillvalue=""):
-        padded = (part.ljust(space) for part, space in zip(parts, widths, strict=True))
+    for lines in zip_longest(*cells, fillvalue=""):
+        padded = (line.ljust(space) for line, space in zip(lines, widths, strict=True))
         yield _GAP.join(padded).rstrip()
 
 
@@ -142,8 +142,10 @@ def _command(scene: Path | None, options: Mapping[str, object], assignments: Seq
     """Return the command that trains a scene as planned; without a scene, the bundled one."""
     given = {**options, "scene": None}
     words = ["crossgrad run"] if scene is None else ["crossgrad run", quote(str(scene))]
-    words += [f"--{name.replace('_', '-')} {_word(each)}" for name, each in given.items() if each]
-    words += [f"--set {quote(each)}" for each in assignments]
+    words += [
+        f"--{name.replace('_', '-')} {_word(value)}" for name, value in given.items() if value
+    ]
+    words += [f"--set {quote(assignment)}" for assignment in assignments]
     return " ".join(words)
 
 

@@ -77,8 +77,8 @@ def degree(evidence: Evidence) -> Finding:
     )
     source = "ours: leave-one-out over the directions of a track, after removing exposure"
     force = "--set backbone.sh_degree=N"
-    usual = "default of the backbone" if evidence.degree is None else str(evidence.degree)
-    plain = Finding(part, usual, "default", "", rule, source, force)
+    default = "default of the backbone" if evidence.degree is None else str(evidence.degree)
+    plain = Finding(part, default, "default", "", rule, source, force)
     if evidence.degree is None:
         return plain.found(f"backbone {name} has no SH degree")
     if evidence.degree == 0:
@@ -97,20 +97,26 @@ def _of_tracks(evidence: Evidence, plain: Finding) -> Finding:
         view_dependence,
     )
 
-    found = view_dependence(evidence.scene)
-    figures = {"tracks": found.tracks, "share": found.share, "low": found.low, "high": found.high}
-    if found.tracks < FEWEST_TRACKS or isnan(found.share):
+    dependence = view_dependence(evidence.scene)
+    figures = {
+        "tracks": dependence.tracks,
+        "share": dependence.share,
+        "low": dependence.low,
+        "high": dependence.high,
+    }
+    if dependence.tracks < FEWEST_TRACKS or isnan(dependence.share):
         return plain.found(
-            f"{found.tracks} tracks with at least {LEAST_OBSERVATIONS} views over at "
+            f"{dependence.tracks} tracks with at least {LEAST_OBSERVATIONS} views over at "
             f"least {LEAST_RADIUS:.0f} degrees; {FEWEST_TRACKS} are needed",
             figures=figures,
         )
     shown = (
-        f"degree 1 explains {found.share:.0%} [{found.low:.0%}, {found.high:.0%}] of the "
-        f"brightness of {found.tracks} tracks"
+        f"degree 1 explains {dependence.share:.0%} "
+        f"[{dependence.low:.0%}, {dependence.high:.0%}] of the "
+        f"brightness of {dependence.tracks} tracks"
     )
-    if found.high >= LEAST_SHARE:
-        return plain.found(shown, decided=found.low >= LEAST_SHARE, figures=figures)
+    if dependence.high >= LEAST_SHARE:
+        return plain.found(shown, decided=dependence.low >= LEAST_SHARE, figures=figures)
     bands = 3 * ((1 + (evidence.degree or 0)) ** 2 - 1)
     saved = f"{bands} of {_OTHER_NUMBERS + bands} numbers of a Gaussian"
     made = plain.found(shown, figures=figures)

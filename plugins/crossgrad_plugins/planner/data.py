@@ -108,12 +108,12 @@ def masks(evidence: Evidence) -> Finding:
 
 def background(evidence: Evidence) -> Finding:
     """Decide the background colour of renders."""
-    part, usual = "background", evidence.config.background
+    part, configured = "background", evidence.config.background
     if evidence.is_given("background"):
-        return given(part, usual, "--background COLOR")
+        return given(part, configured, "--background COLOR")
     plain = Finding(
         part,
-        usual,
+        configured,
         "default",
         "",
         "the colour that transparent photos were blended over, else black, as in viewers",
@@ -121,13 +121,13 @@ def background(evidence: Evidence) -> Finding:
         "--background COLOR",
     )
     note = evidence.scene_note("blended over RGB")
-    found = _BLENDED.search(note) if note else None
-    if note is None or found is None:
+    match = _BLENDED.search(note) if note else None
+    if note is None or match is None:
         return plain.found("no photo is transparent", decided=True)
-    color = ",".join(f"{float(level):g}" for level in found.groups())
+    color = ",".join(f"{float(level):g}" for level in match.groups())
     name = {"0,0,0": "black", "1,1,1": "white"}.get(color, color)
     shown = plain.found(note.removeprefix("photos: "), decided=True)
-    if name == usual:
+    if name == configured:
         return shown
     because = "transparent photos were blended over it"
     return shown.changed(name, {"background": name}, because, "--background COLOR")

@@ -32,14 +32,16 @@ class Evidence:
         Args:
             names: Settings, such as `exposure`, `data.init` or `backbone.sh_degree`.
         """
-        known = {n for n in self.config.model_fields_set if getattr(self.config, n) is not None}
+        settings = {n for n in self.config.model_fields_set if getattr(self.config, n) is not None}
         # A run also stores its defaults; in the group `data`, a default value therefore counts as
         # not set.
-        own, usual = self.config.data, type(self.config.data)()
-        known |= {f"data.{n}" for n in own.model_fields_set if getattr(own, n) != getattr(usual, n)}
-        known |= {f"backbone.{name}" for name in self.config.backbone.options}
-        known |= {f"rules.{name}" for name in self.config.rules}
-        return not known.isdisjoint(names)
+        data, defaults = self.config.data, type(self.config.data)()
+        settings |= {
+            f"data.{n}" for n in data.model_fields_set if getattr(data, n) != getattr(defaults, n)
+        }
+        settings |= {f"backbone.{name}" for name in self.config.backbone.options}
+        settings |= {f"rules.{name}" for name in self.config.rules}
+        return not settings.isdisjoint(names)
 
     @cached_property
     def modes(self) -> Modes:

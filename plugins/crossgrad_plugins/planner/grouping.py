@@ -36,7 +36,7 @@ _NOT_KNOWN: Final = "not known; --probe SECONDS measures it"
 
 def modes(evidence: Evidence) -> Finding:
     """Report how many modes the distances of the cameras have."""
-    found = evidence.modes
+    camera_modes = evidence.modes
     rule = (
         f"two: distances or heights that Otsu's cut separates better than the best of {ONE_OF} "
         f"evenly spread samples, at least {FEWEST} views, {LEAST_SHARE:.0%} of them on each side, "
@@ -44,36 +44,41 @@ def modes(evidence: Evidence) -> Finding:
         f"one distance: range (95th / 5th percentile) < {LEAST_RATIO}"
     )
     source = "ours; Otsu 1979. Sarle's coefficient, the paper's, calls lopsided distances two modes"
-    plain = Finding("modes", _name(found), "default", "", rule, source, "--grouping NAME")
+    plain = Finding("modes", _name(camera_modes), "default", "", rule, source, "--grouping NAME")
     figures = {
-        "bimodality": found.bimodality,
-        "separability": found.cut.separability,
-        "separability_of_even": found.cut.usual,
-        "smaller_share": found.cut.share,
-        "far_over_near": found.cut.ratio,
-        "range": found.spread,
-        "views": len(found.logs),
+        "bimodality": camera_modes.bimodality,
+        "separability": camera_modes.cut.separability,
+        "separability_of_even": camera_modes.cut.usual,
+        "smaller_share": camera_modes.cut.share,
+        "far_over_near": camera_modes.cut.ratio,
+        "range": camera_modes.spread,
+        "views": len(camera_modes.logs),
     }
-    evidence_text = f"{_figures(found)} over {len(found.logs)} views, range {found.spread:.1f}"
-    return plain.found(evidence_text, decided=found.two or found.one, figures=figures)
+    evidence_text = (
+        f"{_figures(camera_modes)} over {len(camera_modes.logs)} views, "
+        f"range {camera_modes.spread:.1f}"
+    )
+    return plain.found(evidence_text, decided=camera_modes.two or camera_modes.one, figures=figures)
 
 
 def pairs(evidence: Evidence) -> Finding:
     """Decide whether steps use pairs of near and far views."""
-    config, found = evidence.config, evidence.modes
-    part, usual = "pairs of views", config.sampler.name
+    config, camera_modes = evidence.config, evidence.modes
+    part, configured = "pairs of views", config.sampler.name
     if evidence.is_given("sampler", "grouping"):
-        return given(part, usual, "--sampler NAME")
+        return given(part, configured, "--sampler NAME")
     rule = (
         f"two modes, {EVEN:.0%} of the views or more in each, and sigma_b^2 / sigma_w^2 >= "
         f"{LEAST_RHO} with its whole interval"
     )
-    plain = Finding(part, usual, "default", "", rule, "paper, Proposition 2", "--sampler near-far")
-    if found.one:
+    plain = Finding(
+        part, configured, "default", "", rule, "paper, Proposition 2", "--sampler near-far"
+    )
+    if camera_modes.one:
         return plain.found(
             "one mode: no near and far groups", decided=True, saved="groups of views"
         )
-    if not found.two:
+    if not camera_modes.two:
         return plain.found("modes undecided")
     return _pairs_of_two_modes(evidence, plain)
 
@@ -149,8 +154,8 @@ def views_per_step(evidence: Evidence) -> Finding:
     if evidence.is_given("views_per_step"):
         return given(part, evidence.config.views_per_step, "--views K")
     rule = "1, unless pairs are drawn: a second view in a step costs as much as a further step"
-    usual = str(max(evidence.view_plan.counts))
-    plain = Finding(part, usual, "default", "", rule, _TWO_VIEWS, "--views K")
+    default = str(max(evidence.view_plan.counts))
+    plain = Finding(part, default, "default", "", rule, _TWO_VIEWS, "--views K")
     if "sampler" in pairs(evidence).settings:
         return replace(plain, choice="2").found("a step has a near and a far view", decided=True)
     if evidence.is_given("sampler", "operator", "batch_rule", "densify_views", "backward"):
@@ -161,9 +166,9 @@ def views_per_step(evidence: Evidence) -> Finding:
         shown += f"; the probe is not conclusive: {probe.problem}"
     elif probe is not None and not isnan(probe.noise_scale):
         figures = {"noise_scale": probe.noise_scale}
-        known = isfinite(probe.noise_scale)
+        finite = isfinite(probe.noise_scale)
         scale = (
-            f"{probe.noise_scale:.0f} views" if known else "larger than all views: no common part"
+            f"{probe.noise_scale:.0f} views" if finite else "larger than all views: no common part"
         )
         shown += f"; gradient noise scale {scale}"
     saved = "extra renders per step"
@@ -173,15 +178,15 @@ def views_per_step(evidence: Evidence) -> Finding:
 def operator(evidence: Evidence) -> Finding:
     """Decide whether gradients are stored separately per view, and how they are combined."""
     part = "operator"
-    usual = "+".join(link.name for link in evidence.config.operators)
+    configured = "+".join(link.name for link in evidence.config.operators)
     if evidence.is_given("operator"):
-        return given(part, usual, "--operator NAME")
+        return given(part, configured, "--operator NAME")
     rule = (
         "project conflicting gradients if pairs are drawn and the conflict is above "
         f"{CHANCE:.0%} with its interval"
     )
     source = "paper; half of all random directions conflict"
-    plain = Finding(part, usual, "default", "", rule, source, "--operator NAME")
+    plain = Finding(part, configured, "default", "", rule, source, "--operator NAME")
     apart = "separate gradients of each view"
     joint = evidence.config.backward == "joint"
     if joint or evidence.modes.one:
@@ -202,22 +207,22 @@ def operator(evidence: Evidence) -> Finding:
             "symmetric",
             {"operator": "symmetric"},
             "gradients of near and far views conflict",
-            f"--operator {usual}",
+            f"--operator {configured}",
         )
     return plain.found(shown, decided=True, saved=apart, figures=figures)
 
 
-def _name(found: Modes) -> str:
-    if found.two:
+def _name(camera_modes: Modes) -> str:
+    if camera_modes.two:
         return "two modes"
-    if not found.one:
+    if not camera_modes.one:
         return "undecided"
-    return "one mode, one distance" if found.spread < LEAST_RATIO else "one mode, continuous"
+    return "one mode, one distance" if camera_modes.spread < LEAST_RATIO else "one mode, continuous"
 
 
-def _figures(found: Modes) -> str:
-    shown = "undefined" if isnan(found.bimodality) else f"{found.bimodality:.2f}"
-    cut = found.cut
+def _figures(camera_modes: Modes) -> str:
+    shown = "undefined" if isnan(camera_modes.bimodality) else f"{camera_modes.bimodality:.2f}"
+    cut = camera_modes.cut
     return (
         f"splitting {cut.quantity} in two explains {cut.separability:.0%} of its "
         f"variance, the best of {ONE_OF} even samples {cut.usual:.0%}; far / near "

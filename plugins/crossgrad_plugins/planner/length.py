@@ -23,14 +23,14 @@ def length(evidence: Evidence) -> Finding:
     part, config, photos = "length", evidence.config, len(evidence.scene.train_views)
     most, seconds = most_views(evidence), config.seconds
     within = "" if seconds is None else f" within {seconds:g} s"
-    usual = f"{DEFAULT_STEPS:,} steps" if seconds is None else f"{seconds:g} s"
+    full_length = f"{DEFAULT_STEPS:,} steps" if seconds is None else f"{seconds:g} s"
     if config.steps is not None:
         return given(part, f"{config.steps:,} steps", _EXACTLY)
     if config.max_views is not None:
         return given(part, f"{config.max_views:,} views{within}", _EXACTLY)
     plain = Finding(
         part,
-        usual,
+        full_length,
         "default",
         "",
         f"{PASSES} views of each training photo, at least {FEWEST_VIEWS:,}: more "
@@ -46,9 +46,9 @@ def length(evidence: Evidence) -> Finding:
     views = views_of_steps(evidence).paced(DEFAULT_STEPS).views(DEFAULT_STEPS)
     if seconds is None and most >= views:
         return plain.found(shown, decided=True, figures={"views": most})
-    saved = f"the remaining part of {usual}"
+    saved = f"the remaining part of {full_length}"
     if seconds is None:
-        saved = f"{1.0 - most / views:.0%} of the views of {usual}"
+        saved = f"{1.0 - most / views:.0%} of the views of {full_length}"
     because = f"more than {most // photos:,} views of each photo gain little"
-    found = plain.found(shown, figures={"views": most})
-    return found.changed(f"{most:,} views{within}", {"max_views": most}, because, _EXACTLY, saved)
+    finding = plain.found(shown, figures={"views": most})
+    return finding.changed(f"{most:,} views{within}", {"max_views": most}, because, _EXACTLY, saved)

@@ -92,8 +92,8 @@ class Modes:
         split by distance.
         """
         cuts = (self._by(self.quantity, self.logs), self._by(HEIGHT, self.heights))
-        modes = [each for each in cuts if each.two]
-        return max(modes, key=lambda each: each.separability, default=cuts[0])
+        modes = [cut for cut in cuts if cut.two]
+        return max(modes, key=lambda cut: cut.separability, default=cuts[0])
 
     @cached_property
     def spread(self) -> float:
@@ -140,11 +140,11 @@ def modes_of(scene: Scene) -> Modes:
     if not views:
         return Modes(DEPTH, np.zeros(0), np.zeros(0))
     footprints = np.array([footprint_of(scene, view) for view in views])
-    known = np.isfinite(footprints) & (footprints > 0.0)
+    measured = np.isfinite(footprints) & (footprints > 0.0)
     axis, _ = upward(scene)
     heights = altitudes(scene, views, axis)
-    if 2 * int(known.sum()) >= len(views):
-        return Modes(DEPTH, -np.log(footprints[known]), heights[known])
+    if 2 * int(measured.sum()) >= len(views):
+        return Modes(DEPTH, -np.log(footprints[measured]), heights[measured])
     logs = log_distances(scene, views).values
     there = np.isfinite(logs)
     return Modes(FROM_THE_MEAN, logs[there], heights[there])

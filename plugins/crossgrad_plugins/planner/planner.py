@@ -79,7 +79,7 @@ def plan_of(config: RunConfig, scene: Scene, probe_seconds: float | None = None)
     """
     begun = perf_counter()
     evidence = Evidence(config, scene, probe_seconds)
-    findings = tuple(part(evidence) for part in PARTS)
+    findings = tuple(decide(evidence) for decide in PARTS)
     return Plan(scene.name, findings, perf_counter() - begun)
 
 

@@ -55,22 +55,24 @@ def view_dependence(scene: Scene) -> ViewDependence:
         UserError: A photo cannot be decoded.
     """
     views = scene.train_views
-    found = observations_of(scene, views)
-    if not found.count:
+    observations = observations_of(scene, views)
+    if not observations.count:
         return _share(np.zeros((0, 2)))
-    stops = found.stops - fitted(found, len(views)).gains[found.photos]
-    directions = scene.centers[found.photos] - scene.points[found.rows[found.points]]
+    stops = observations.stops - fitted(observations, len(views)).gains[observations.photos]
+    directions = (
+        scene.centers[observations.photos] - scene.points[observations.rows[observations.points]]
+    )
     lengths = np.linalg.norm(directions, axis=1, keepdims=True)
     directions = np.divide(directions, lengths, out=np.zeros_like(directions), where=lengths > 0.0)
-    tracks = _tracks(found)
-    errors = [_errors(stops[each], directions[each]) for each in tracks]
+    tracks = _tracks(observations)
+    errors = [_errors(stops[indices], directions[indices]) for indices in tracks]
     return _share(np.concatenate([np.zeros((0, 2)), *errors])[:_MOST_TRACKS])
 
 
-def _tracks(found: Observations) -> Iterator[NDArray[np.int64]]:
+def _tracks(observations: Observations) -> Iterator[NDArray[np.int64]]:
     """Yield the observations [T, n] of the tracks of each sufficient length n, longest first."""
-    order = np.argsort(found.points, kind="stable")
-    lengths = np.bincount(found.points)
+    order = np.argsort(observations.points, kind="stable")
+    lengths = np.bincount(observations.points)
     starts = np.cumsum(lengths) - lengths
     for length in sorted(set(lengths[lengths >= LEAST_OBSERVATIONS].tolist()), reverse=True):
         yield order[starts[lengths == length][:, None] + np.arange(length)]
@@ -103,7 +105,7 @@ def _share(errors: _Floats) -> ViewDependence:
         return ViewDependence(count, float("nan"), float("nan"), float("nan"))
     rng = np.random.default_rng(0)
     drawn = [errors[rng.integers(0, count, count)].sum(axis=0) for _ in range(_DRAWS)]
-    sums = np.array([each for each in drawn if each[0] > 0.0])
+    sums = np.array([total for total in drawn if total[0] > 0.0])
     low, high = np.percentile(1.0 - sums[:, 1] / sums[:, 0], [2.5, 97.5])
     constant, plane = errors.sum(axis=0)
     return ViewDependence(count, float(1.0 - plane / constant), float(low), float(high))

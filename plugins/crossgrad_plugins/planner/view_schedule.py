@@ -52,9 +52,9 @@ def directions(scene: Scene, grouping: ComponentChoice) -> Directions:
 
 def view_schedule(evidence: Evidence) -> Finding:
     """Decide whether far views are drawn more often than near views at first."""
-    part, usual = "view schedule", evidence.config.sampler.name
+    part, configured = "view schedule", evidence.config.sampler.name
     if evidence.is_given("sampler", "grouping"):
-        return given(part, usual, "--sampler NAME")
+        return given(part, configured, "--sampler NAME")
     rule = (
         f"draw far : near = {FAR_TO_NEAR} : 1 at first if far views look in one "
         f"direction (median within {WITHIN:.0f} degrees) and near views elsewhere "
@@ -63,7 +63,7 @@ def view_schedule(evidence: Evidence) -> Finding:
         f"or with fewer than {REFERENCE:,} views"
     )
     source = "Horizon-GS, 2 : 1; docs/samplers.md#far-views-first"
-    plain = Finding(part, usual, "default", "", rule, source, "--sampler horizon")
+    plain = Finding(part, configured, "default", "", rule, source, "--sampler horizon")
     if not evidence.is_measured or evidence.is_given("operator", "views_per_step"):
         return plain.found("measured only with recipe auto and single views")
     if not _in_short_run(evidence):
@@ -80,14 +80,14 @@ def _schedule_of_two_modes(evidence: Evidence, plain: Finding) -> Finding:
     cut = evidence.modes.cut
     if cut.share < EVEN:
         return plain.found(f"the smaller mode has {cut.share:.0%} of the views")
-    found = directions(evidence.scene, cut.grouping)
-    figures = {"far_degrees": found.far, "near_degrees": found.near}
+    angles = directions(evidence.scene, cut.grouping)
+    figures = {"far_degrees": angles.far, "near_degrees": angles.near}
     shown = (
         "relative to the mean direction of the far views, far views look "
-        f"{found.far:.0f} degrees away, near views {found.near:.0f} (medians)"
+        f"{angles.far:.0f} degrees away, near views {angles.near:.0f} (medians)"
     )
     made = plain.found(shown, decided=True, figures=figures)
-    if not found.differ:
+    if not angles.differ:
         return made
     sampler: dict[str, Json] = {"sampler": "horizon", "sampler.coarse": [FAR_TO_NEAR, 1]}
     choice = f"horizon by {cut.grouping.name}, {FAR_TO_NEAR} far views for each near view at first"

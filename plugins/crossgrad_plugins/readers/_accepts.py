@@ -87,8 +87,8 @@ def uc_gs(path: Path, images: str = "images") -> bool:
 
 def pose_files(scene: Path) -> list[str]:
     """Return the scene's own pose file if there is one, else the pose files of all blocks."""
-    found = [path.relative_to(scene).as_posix() for path in _walk(scene, 0)]
-    return [TRANSFORMS_FILE] if TRANSFORMS_FILE in found else sorted(found)
+    names = [path.relative_to(scene).as_posix() for path in _walk(scene, 0)]
+    return [TRANSFORMS_FILE] if TRANSFORMS_FILE in names else sorted(names)
 
 
 def _walk(folder: Path, depth: int) -> Iterator[Path]:
@@ -109,14 +109,14 @@ def is_held_out(name: str) -> bool:
     path = PurePosixPath(name)
     folders = (folder.lower() for folder in path.parts[:-1])
     named = _EVAL.search(path.name.lower()) is not None
-    return named or any(each.startswith(_TEST) for each in folders)
+    return named or any(folder.startswith(_TEST) for folder in folders)
 
 
 def _photos_below(images: Path) -> Iterator[str]:
     """Yield names of photos in a folder, at most two folders deep and at most `_MOST` names."""
-    found = (path for pattern in ("*.*", "*/*.*", "*/*/*.*") for path in images.glob(pattern))
+    paths = (path for pattern in ("*.*", "*/*.*", "*/*/*.*") for path in images.glob(pattern))
     try:
-        for _, path in zip(range(_MOST), found, strict=False):
+        for _, path in zip(range(_MOST), paths, strict=False):
             yield path.relative_to(images).as_posix()
     except OSError:
         return
@@ -176,16 +176,16 @@ class Kind:
         """
         if named is not None:
             return inside.file(inside.name(named, "reader.file"), "reader.file")
-        found = self.find(inside, None) or self.find_near(inside)
-        if len(found) == 1:
-            return inside.file(found[0].name, found[0])
-        several = f"several {self.form}s" if found else f"no {self.form}"
+        files = self.find(inside, None) or self.find_near(inside)
+        if len(files) == 1:
+            return inside.file(files[0].name, files[0])
+        several = f"several {self.form}s" if files else f"no {self.form}"
         raise UserError(
             f"the scene contains {several} of {self.program}, and it is not clear which "
             "one to read",
             where=inside.scene,
             expected=self.expected,
-            found=", ".join(path.name for path in found) or "none",
+            found=", ".join(path.name for path in files) or "none",
             todo="name the file, with --set reader.file=NAME, or export it",
         )
 

@@ -31,7 +31,7 @@ class Columns:
         text = head.decode("utf-16" if wide else "utf-8", "replace")
         tables = (cls(column_names(line.split(sign)), sign)
                   for line in text.splitlines() for sign in _DELIMITERS)  # fmt: skip
-        return max(tables, key=lambda each: len(known & {*each.names}), default=cls((), ","))
+        return max(tables, key=lambda table: len(known & {*table.names}), default=cls((), ","))
 
 
 def column_names(cells: list[str]) -> tuple[str, ...]:

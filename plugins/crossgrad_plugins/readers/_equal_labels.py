@@ -63,7 +63,7 @@ def paired(
         if len(names) == 1 and counts[names[0]] > 1
     ]
     if unclear or twice:
-        found = next(names for names in fits if len(names) > 1) if unclear else sorted(counts)
+        photo_names = next(names for names in fits if len(names) > 1) if unclear else sorted(counts)
         raise UserError(
             "several cameras or photos have the same label"
             if unclear
@@ -71,7 +71,7 @@ def paired(
             where=name_some(unclear or twice),
             expected="labels that include the folders of the photos, or sensors or groups named "
             "after these folders",
-            found=f"photos {name_some(found)}",
+            found=f"photos {name_some(photo_names)}",
             todo="name the sensors or camera groups after the folders of their photos, and "
             "export the cameras again",
         )
@@ -99,7 +99,7 @@ def _in_folders(names: Sequence[str], hints: Sequence[str]) -> list[str]:
     return [
         name
         for name in names
-        if wanted <= {part.casefold() for part in PurePosixPath(name).parts[:-1]}
+        if wanted <= {folder.casefold() for folder in PurePosixPath(name).parts[:-1]}
     ]
 
 
@@ -145,15 +145,15 @@ def _by_order(cameras: Sequence[Labelled], fits: list[list[str]]) -> list[str]:
         owners = list(dict.fromkeys(getattr(cameras[i], of) for i in unclear))
         if not unclear or len(owners) != len(folders):
             continue
-        places: Mapping[str, str] = dict(zip(owners, folders, strict=True))
-        found = {
-            i: [n for n in fits[i] if _folder(n) == places[getattr(cameras[i], of)]]
+        folder_of: Mapping[str, str] = dict(zip(owners, folders, strict=True))
+        chosen = {
+            i: [n for n in fits[i] if _folder(n) == folder_of[getattr(cameras[i], of)]]
             for i in unclear
         }
-        if all(len(names) == 1 for names in found.values()):
-            for i, names in found.items():
+        if all(len(names) == 1 for names in chosen.values()):
+            for i, names in chosen.items():
                 fits[i] = names
-            pairs = ", ".join(f"{owner or 'none'} {place}" for owner, place in places.items())
+            pairs = ", ".join(f"{owner or 'none'} {folder}" for owner, folder in folder_of.items())
             return [
                 (f"photos with equal labels are paired by the order of {of}s and folders: {pairs}")
             ]

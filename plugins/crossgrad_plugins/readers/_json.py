@@ -106,7 +106,7 @@ class Fields:
         value = self.value.get(key)
         if not isinstance(value, list):
             self.wrong(key, "a list of strings")
-        texts = [each for each in value if isinstance(each, str)]
+        texts = [item for item in value if isinstance(item, str)]
         if len(texts) != len(value):
             self.wrong(key, "a list of strings")
         return texts
@@ -120,14 +120,14 @@ class Fields:
         value = self.value.get(key)
         if not isinstance(value, dict):
             self.wrong(key, "an object")
-        return {name: self._child(each, f"{key}.{name}") for name, each in value.items()}
+        return {name: self._child(item, f"{key}.{name}") for name, item in value.items()}
 
     def items(self, key: str) -> list["Fields"]:
         """Return the objects of a list."""
         value = self.value.get(key)
         if not isinstance(value, list):
             self.wrong(key, "a list of objects")
-        return [self._child(each, f"{key}[{i}]") for i, each in enumerate(value)]
+        return [self._child(item, f"{key}[{i}]") for i, item in enumerate(value)]
 
     def _child(self, value: object, name: str) -> "Fields":
         place = f"{self.place}{'.' if self.place else ''}{name}"
@@ -192,5 +192,5 @@ def _flat(value: object, shape: tuple[int, ...]) -> Iterator[object]:
     if not shape:
         yield value
     elif isinstance(value, list) and len(value) == shape[0]:
-        for each in value:
-            yield from _flat(each, shape[1:])
+        for item in value:
+            yield from _flat(item, shape[1:])

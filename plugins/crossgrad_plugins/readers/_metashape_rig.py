@@ -45,16 +45,16 @@ class Rig:
             UserError: A transform or an offset is not a rotation and a shift.
         """
         offsets = {
-            each.get("id", ""): offset
-            for i, each in enumerate(chunk.iterfind("sensors/sensor"))
-            if (offset := _offset(each, file, f"sensors.sensor[{i}]")) is not None
+            sensor.get("id", ""): offset
+            for i, sensor in enumerate(chunk.iterfind("sensors/sensor"))
+            if (offset := _offset(sensor, file, f"sensors.sensor[{i}]")) is not None
         }
         transforms = {
-            each.get("id", ""): _transform(element, file, f"cameras.camera[{i}]")
-            for i, each in enumerate(cameras)
-            if (element := each.find("transform")) is not None
+            camera.get("id", ""): _transform(element, file, f"cameras.camera[{i}]")
+            for i, camera in enumerate(cameras)
+            if (element := camera.find("transform")) is not None
         }
-        sensors = {each.get("id", ""): each.get("sensor_id", "") for each in cameras}
+        sensors = {camera.get("id", ""): camera.get("sensor_id", "") for camera in cameras}
         return cls(offsets, transforms, sensors)
 
     def is_slave(self, camera: Element) -> bool:

@@ -77,8 +77,8 @@ def find_points(
     if named is not None:
         name = inside.found(named, where, base, inside.points)
         return _placed(read_cloud(inside.file(name, where), name), frame)
-    for usual in USUAL:
-        name = inside.name(usual, where, base)
+    for usual_name in USUAL:
+        name = inside.name(usual_name, where, base)
         if (inside.scene / name).is_file():
             return _placed(read_cloud(inside.file(name, where), name), frame)
     return NO_POINTS

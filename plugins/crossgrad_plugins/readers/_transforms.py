@@ -134,8 +134,8 @@ def read_lens(inside: Inside, frame: Fields, whole: Fields, photo: str) -> Calib
     size = _size(inside, holder, photo)
     lens = _frame(size, holder, number)
     radial, tangential = _terms(holder, number)
-    own, named = _says_fisheye(frame), holder("camera_model")
-    if _says_fisheye(whole) if own is None else own:
+    frame_is_fisheye, named = _says_fisheye(frame), holder("camera_model")
+    if _says_fisheye(whole) if frame_is_fisheye is None else frame_is_fisheye:
         return lens.fisheye(radial)
     model = named.text("camera_model", "PERSPECTIVE").upper()
     if model not in _PERSPECTIVE | _FISHEYE:
@@ -149,8 +149,8 @@ def _completing(frame: Fields, whole: Fields) -> Fields:
     """Return the file with only the fields that may complete the fields of a frame."""
     others = [other for both in _WAYS for way, other in (both, both[::-1])
               if any(key in frame for key in way)]  # fmt: skip
-    own = _says_fisheye(frame)
-    if own is not None and own != bool(_says_fisheye(whole)):
+    frame_is_fisheye = _says_fisheye(frame)
+    if frame_is_fisheye is not None and frame_is_fisheye != bool(_says_fisheye(whole)):
         others += _WAYS[1]  # These are distortion parameters of another kind of lens.
     hidden = frozenset[str]().union(*others)
     return replace(whole, value={k: v for k, v in whole.value.items() if k not in hidden})

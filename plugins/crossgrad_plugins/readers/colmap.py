@@ -175,8 +175,8 @@ def _find_rows(
         return np.zeros(0, dtype=np.int64)
     # searchsorted is many times faster with sorted queries.
     points = np.sort(points)
-    place = np.minimum(np.searchsorted(ids, points), len(ids) - 1)
-    return np.asarray(order[place[ids[place] == points]], dtype=np.int64)
+    positions = np.minimum(np.searchsorted(ids, points), len(ids) - 1)
+    return np.asarray(order[positions[ids[positions] == points]], dtype=np.int64)
 
 
 def _make_pose(image: ColmapImage, folder: Path) -> NDArray[np.float64]:

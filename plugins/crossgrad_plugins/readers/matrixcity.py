@@ -79,7 +79,7 @@ def _read(inside: Inside, name: str) -> list[Posed]:
     whole = read_object(inside.file(name, inside.scene / name))
     base = PurePosixPath(name).parent
     photos = str(base / _PHOTOS if (inside.scene / base / _PHOTOS).is_dir() else base)
-    return [_frame(inside, each, whole, photos) for each in whole.items("frames")]
+    return [_frame(inside, frame, whole, photos) for frame in whole.items("frames")]
 
 
 def _frame(inside: Inside, frame: Fields, whole: Fields, photos: str) -> Posed:

@@ -88,8 +88,10 @@ class MetashapeReader(Reader):
         sensors = _sensors(chunk, file, {camera.sensor for camera in cameras})
         names, pairs = _names(inside, chunk, cameras, sensors, path / images)
         views = tuple(
-            raw_view(name, sensors[each.sensor], from_opencv(each.rotation, each.center, world))
-            for name, each in zip(names, cameras, strict=True)
+            raw_view(
+                name, sensors[camera.sensor], from_opencv(camera.rotation, camera.center, world)
+            )
+            for name, camera in zip(names, cameras, strict=True)
         )
         points = find_points(inside, options, self.points, "reader.points")
         other = "chunk" if self.frame == "local" else "local"
@@ -137,18 +139,18 @@ def _cameras(chunk: Element, file: Path) -> tuple[list[_Camera], list[str]]:
         raise _missing(file, "cameras")
     elements = list(holder.iter("camera"))
     rig = Rig.of(chunk, elements, file)
-    groups = {each: group.get("label", "") for group in holder.iter("group")
-              for each in group.iter("camera")}  # fmt: skip
-    components = {each.get("id"): each.get("component_id", "") for each in elements}
+    groups = {element: group.get("label", "") for group in holder.iter("group")
+              for element in group.iter("camera")}  # fmt: skip
+    components = {element.get("id"): element.get("component_id", "") for element in elements}
     posed, slaves = [], 0
-    for i, each in enumerate(elements):
-        pose = rig.pose(each) if each.get("enabled", "true") != "false" else None
+    for i, element in enumerate(elements):
+        pose = rig.pose(element) if element.get("enabled", "true") != "false" else None
         if pose is None:
             continue
-        component = each.get("component_id", components.get(each.get("master_id"), ""))
-        fields = Fields(dict(each.attrib), file, f"cameras.camera[{i}]")
-        posed.append(_camera(fields, groups.get(each, ""), component, pose))
-        slaves += rig.is_slave(each)
+        component = element.get("component_id", components.get(element.get("master_id"), ""))
+        fields = Fields(dict(element.attrib), file, f"cameras.camera[{i}]")
+        posed.append(_camera(fields, groups.get(element, ""), component, pose))
+        slaves += rig.is_slave(element)
     sizes = Counter(camera.component for camera in posed)
     best = max(sizes, key=lambda component: sizes[component], default="")
     kept = [camera for camera in posed if camera.component == best]
@@ -203,8 +205,8 @@ def _world(
 
 def _transform(chunk: Element, file: Path, component: str) -> tuple[Frame3D, str | None]:
     """Return the component's similarity, else the chunk's, and its source; None without any."""
-    places = [(each, "component") for each in chunk.iterfind("components/component")
-              if each.get("id", "") == component]  # fmt: skip
+    places = [(candidate, "component") for candidate in chunk.iterfind("components/component")
+              if candidate.get("id", "") == component]  # fmt: skip
     for holder, name in (*places, (chunk, "chunk")):
         element = holder.find("transform")
         if element is not None:
@@ -231,9 +233,9 @@ def _similarity(element: Element, file: Path, place: str) -> Frame3D:
 def _sensors(chunk: Element, file: Path, used: set[str]) -> dict[str, Calibration]:
     """Return the calibrations of the sensors in use, by sensor id."""
     return {
-        name: _sensor(each, file, f"sensors.sensor[{i}]")
-        for i, each in enumerate(chunk.iterfind("sensors/sensor"))
-        if (name := each.get("id", "")) in used
+        name: _sensor(sensor, file, f"sensors.sensor[{i}]")
+        for i, sensor in enumerate(chunk.iterfind("sensors/sensor"))
+        if (name := sensor.get("id", "")) in used
     }
 
 
@@ -247,22 +249,24 @@ def _sensor(element: Element, file: Path, place: str) -> Calibration:
         raise refuse_lens(what, fields.where("rolling_shutter"), _GLOBAL)
     # In the XML, an adjusted calibration follows the initial calibration.
     calibrations = element.findall("calibration")
-    adjusted = [each for each in calibrations if each.get("class") == "adjusted"]
+    adjusted = [
+        calibration for calibration in calibrations if calibration.get("class") == "adjusted"
+    ]
     chosen = next(reversed(adjusted or calibrations), None)
     resolution = element.find("resolution")
     if chosen is None or resolution is None:
         fields.wrong("calibration", "a resolution and a calibration with a focal length f")
     size = {key: _parsed(resolution.get(key)) for key in ("width", "height")}
-    values = {each.tag: _parsed(each.text) for each in chosen}
+    values = {term.tag: _parsed(term.text) for term in chosen}
     return _lens(Fields({**values, **size}, file, f"{place}.calibration"), kind)
 
 
 def _is_rolling(element: Element) -> bool:
     """Return True if Metashape compensates the rolling shutter of a sensor."""
-    told = [each.get("value") for each in element.iterfind("property")
-            if each.get("name") == _ROLLING]  # fmt: skip
-    told += [each.get("value", each.text) for each in element.iterfind(_ROLLING)]
-    return any(word.lower() not in _OFF for text in told for word in (text or "").split())
+    texts = [child.get("value") for child in element.iterfind("property")
+             if child.get("name") == _ROLLING]  # fmt: skip
+    texts += [child.get("value", child.text) for child in element.iterfind(_ROLLING)]
+    return any(word.lower() not in _OFF for text in texts for word in (text or "").split())
 
 
 def _parsed(text: str | None) -> object:
@@ -298,7 +302,7 @@ def _names(
 ) -> tuple[list[str], list[str]]:
     """Return the photo of each camera, relative to the photo folder, and notes on the pairing."""
     labels = {
-        each.get("id", ""): each.get("label", "") for each in chunk.iterfind("sensors/sensor")
+        sensor.get("id", ""): sensor.get("label", "") for sensor in chunk.iterfind("sensors/sensor")
     }
     photos = FileNames(PhotoFolder(images).names)
     labelled = []

@@ -59,7 +59,7 @@ class NerfstudioReader(Reader):
         base = str(PurePosixPath(name).parent)
         whole = read_object(inside.file(name, "reader.file"))
         world = _applied(whole).inverse
-        frames = [read_frame(inside, each, whole, base, world) for each in whole.items("frames")]
+        frames = [read_frame(inside, frame, whole, base, world) for frame in whole.items("frames")]
         images, views = raw_views(frames)
         points = find_points(inside, options, *self._points(whole, base), frame=world)
         check_seen(points, views, whole.file)

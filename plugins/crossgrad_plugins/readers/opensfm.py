@@ -67,7 +67,7 @@ class OpenSfmReader(Reader):
         cameras = {name: _camera(fields) for name, fields in chosen.members("cameras").items()}
         shots = chosen.members("shots")
         photos = PhotoNames.of(path / images, shots)
-        views = tuple(_view(inside, photos, each, cameras) for each in shots.items())
+        views = tuple(_view(inside, photos, shot, cameras) for shot in shots.items())
         points = _points(chosen)
         head = (
             f"OpenSfM: {count(len(views), 'posed image')}, {count(len(cameras), 'camera')}, "
@@ -203,12 +203,12 @@ def _column(points: Sequence[Fields], key: str) -> NDArray[np.float64]:
     All points are converted at once, because there may be millions. If a number is wrong, the
     points are converted one by one, so that the error names the field.
     """
-    stored = [each.value.get(key) for each in points]
-    lists = [each for each in stored if isinstance(each, list) and len(each) == 3]  # noqa: PLR2004
+    stored = [point.value.get(key) for point in points]
+    lists = [value for value in stored if isinstance(value, list) and len(value) == 3]  # noqa: PLR2004
     flat = list(chain.from_iterable(lists))
     if len(lists) == len(stored) and set(map(type, flat)) <= {int, float}:
         with suppress(OverflowError):
             table = np.array(flat, dtype=np.float64).reshape(-1, 3)
             if (np.abs(table) <= FARTHEST).all():
                 return table
-    return np.array([each.numbers(key, 3) for each in points]).reshape(-1, 3)
+    return np.array([point.numbers(key, 3) for point in points]).reshape(-1, 3)

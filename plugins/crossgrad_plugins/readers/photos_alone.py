@@ -40,8 +40,8 @@ class PhotosAloneReader(Reader):
                 where=photos,
                 todo="name its folder with --set reader.scene=FOLDER",
             )
-        place = self.scene or photos.with_name(f"{photos.name}-scene")
-        told = made_or_ready(photos, place, Settings())
-        scene = ColmapReader().read(place, options)
-        lines = (f"the photos were prepared into {place}", *told)
+        folder = self.scene or photos.with_name(f"{photos.name}-scene")
+        messages = made_or_ready(photos, folder, Settings())
+        scene = ColmapReader().read(folder, options)
+        lines = (f"the photos were prepared into {folder}", *messages)
         return replace(scene, notes=(*(f"prepare: {line}" for line in lines), *scene.notes))

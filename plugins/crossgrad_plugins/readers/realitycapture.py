@@ -109,7 +109,7 @@ def _rows(file: Path) -> list[_Row]:
     first = next((i for i, row in enumerate(rows) if column_names(row) == header), None)
     if first is None:
         raise _wrong(file, "a header without quotes", "quotes before the header, or in it")
-    found = []
+    photo_rows = []
     for number, row in enumerate(rows[first + 1 :], first + 2):
         cells = [cell.strip(' "') for cell in row]
         if not any(cells) or (cells[0].startswith("#") and len(cells) != len(header)):
@@ -117,8 +117,8 @@ def _rows(file: Path) -> list[_Row]:
         if len(cells) < len(header) or any(cells[len(header) :]):
             raise _wrong(file, f"{len(header)} cells in line {number}", f"{len(row)} cells")
         named = dict(zip(header, cells, strict=False))
-        found.append(_Row(named[NAME_COLUMN], _numbers(named, file, number)))
-    return found
+        photo_rows.append(_Row(named[NAME_COLUMN], _numbers(named, file, number)))
+    return photo_rows
 
 
 def _numbers(cells: Mapping[str, str], file: Path, number: int) -> Fields:

@@ -42,5 +42,5 @@ class UcGsReader(ColmapReader):
 def _place(name: str) -> str:
     """Return a name without the folders that separate training from held-out photos."""
     *folders, file = PurePosixPath(name).parts
-    kept = [each for each in folders if not each.lower().startswith((_TRAIN, _TEST))]
+    kept = [folder for folder in folders if not folder.lower().startswith((_TRAIN, _TEST))]
     return "/".join((*kept, file))

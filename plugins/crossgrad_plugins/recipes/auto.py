@@ -107,13 +107,13 @@ class Choice:
     @cached_property
     def _default_densifier(self) -> str:
         facts = self.facts
-        usual = facts.backbone.default_densifier
-        suits = usual == DENSIFIER and self.is_plain and facts.photos >= MANY_PHOTOS
+        default = facts.backbone.default_densifier
+        suits = default == DENSIFIER and self.is_plain and facts.photos >= MANY_PHOTOS
         here = suits and facts.short and facts.device == "cpu"
         if not here or self.default_growth(budgeted=True) == "unbounded":
-            return usual
+            return default
         needs = facts.densifier(SHORT_DENSIFIER).needs
-        return SHORT_DENSIFIER if needs <= facts.provides else usual
+        return SHORT_DENSIFIER if needs <= facts.provides else default
 
     @cached_property
     def densifier(self) -> Densifier:
@@ -138,8 +138,8 @@ class Choice:
     @cached_property
     def growth(self) -> Literal["unbounded", "budget"]:
         """The growth mode of this run; at the published length there is no budget."""
-        usual = self.default_growth(budgeted=self.densifier.budgeted)
-        return usual if self.length < REFERENCE or "growth" in self.given else "unbounded"
+        default = self.default_growth(budgeted=self.densifier.budgeted)
+        return default if self.length < REFERENCE or "growth" in self.given else "unbounded"
 
     @cached_property
     def led(self) -> bool:
@@ -150,8 +150,8 @@ class Choice:
 def components(choice: Choice) -> list[Decision]:
     """Return the decisions about components."""
     facts, name = choice.facts, choice.densifier_name
-    usual = facts.backbone.default_densifier
-    swapped = name != usual
+    default = facts.backbone.default_densifier
+    swapped = name != default
     budgeted = choice.densifier.budgeted
     led = not choice.densifier.edits or choice.default_growth(budgeted=budgeted) == "budget"
     first = led and choice.is_plain and facts.device == "cpu" and facts.short
@@ -170,7 +170,7 @@ def components(choice: Choice) -> list[Decision]:
             if swapped
             else "default of the backbone",
             f"{facts.photos} training photos; {SCHEDULES}",
-            f"--densifier {usual}" if swapped else "",
+            f"--densifier {default}" if swapped else "",
         ),
         Decision(
             "resolution",
@@ -208,11 +208,11 @@ def growth(choice: Choice) -> list[Decision]:
     """Return the decisions about density control."""
     facts, led = choice.facts, choice.led
     schedule = facts.schedule(facts.unit)
-    usual = choice.default_growth(budgeted=choice.densifier.budgeted)
+    default = choice.default_growth(budgeted=choice.densifier.budgeted)
     long = (
         facts.unit == "views" and not facts.published and choice.length >= SHORTEST_RUN_WITH_EDITS
     )
-    edits = EDITS if usual == "budget" and long else 0
+    edits = EDITS if default == "budget" and long else 0
     resets = 0 if led else choice.densifier.window(schedule).reset_every or 0
     rows = [
         Decision("schedule_unit", facts.unit, "published numbers" if facts.published else "any K"),
@@ -271,7 +271,7 @@ def rates(choice: Choice) -> list[Decision]:
         values = {"rate_factor": 1.0, "few_pass_rates": False, "beta1": BETA1, "beta2": BETA2}
         return [Decision(name, value, UNKNOWN, SCHEDULES) for name, value in values.items()]
     factor, few_passes = _rate_factor(choice), choice.few_passes
-    own = few_passes and "rate_factor" not in choice.given
+    per_block = few_passes and "rate_factor" not in choice.given
     beta1, beta2 = _beta1(choice), _beta2(choice)
     few = f"fewer than {FEW_PASSES} views of each photo"
     return [
@@ -284,10 +284,10 @@ def rates(choice: Choice) -> list[Decision]:
         ),
         Decision(
             "few_pass_rates",
-            own,
-            few if own else "one factor for all blocks",
+            per_block,
+            few if per_block else "one factor for all blocks",
             SCHEDULES,
-            "--set few_pass_rates=false" if own else "",
+            "--set few_pass_rates=false" if per_block else "",
         ),
         Decision(
             "beta1",

@@ -46,7 +46,7 @@ class Course:
     def of_parts(cls, scales: Sequence[float]) -> "Course":
         """Return a course whose scales last equally long and together fill the window."""
         count = len(scales)
-        return cls(tuple((part + 1) / count for part in range(count)), tuple(scales))
+        return cls(tuple((stage + 1) / count for stage in range(count)), tuple(scales))
 
     @classmethod
     def of_stages(cls, stages: Iterable[tuple[float, float]]) -> "Course":
@@ -55,8 +55,8 @@ class Course:
 
     def at(self, progress: float) -> float:
         """Return the scale after a share of the window."""
-        part = bisect_right(self.ends, progress)
-        return self.scales[part] if part < len(self.scales) else 1.0
+        stage = bisect_right(self.ends, progress)
+        return self.scales[stage] if stage < len(self.scales) else 1.0
 
     def pixels(self, progress: float) -> float:
         """Return the sum of rendered pixels up to a share of the window, in photos at full size.
@@ -74,12 +74,12 @@ class Course:
             return "full size"
         scales = (*self.scales, 1.0)
         starts = [schedule.step_of(ceil(end * window)) + 1 for end in (0.0, *self.ends)]
-        told = [f"1/{1 / scales[0]:.3g} to step {starts[bisect_right(scales, scales[0])] - 1}"]
+        texts = [f"1/{1 / scales[0]:.3g} to step {starts[bisect_right(scales, scales[0])] - 1}"]
         for octave in (0.25, 0.5):
-            part = bisect_left(scales, octave)
-            if scales[0] < octave and scales[part] < 1.0:
-                told.append(f"1/{1 / octave:g} from step {starts[part]}")
-        return ", ".join((*told, f"full size from step {starts[-1]}"))
+            stage = bisect_left(scales, octave)
+            if scales[0] < octave and scales[stage] < 1.0:
+                texts.append(f"1/{1 / octave:g} from step {starts[stage]}")
+        return ", ".join((*texts, f"full size from step {starts[-1]}"))
 
 
 @dataclass(frozen=True)
@@ -121,13 +121,13 @@ class CoarseToFine(Resolution):
         window = self.window(context.schedule)
         progress = context.schedule.counted(context.step - 1) / window if window else inf
         reached = dict(cast("Mapping[str, float]", state.values.get(_REACHED, {})))
-        found = []
+        view_scales = []
         for view in context.views:
             regime = view.regime if view.regime in parts else next(iter(parts), "")
             scale = parts[regime].course.at(progress) if parts else 1.0
             reached[regime] = scale = max(scale, reached.get(regime, 0.0))
-            found.append(self.of_photo(view.camera, scale))
-        return tuple(found), PluginState({_REACHED: cast("Json", reached)})
+            view_scales.append(self.of_photo(view.camera, scale))
+        return tuple(view_scales), PluginState({_REACHED: cast("Json", reached)})
 
     def measured(self, scene: Scene) -> "CoarseToFine":
         """Return the resolution fitted to the scene; a run calls this before the first step."""
@@ -137,8 +137,8 @@ class CoarseToFine(Resolution):
     def messages(self, schedule: Schedule) -> tuple[str, ...]:
         window = self.window(schedule)
         texts = {name: part.course.text(schedule, window) for name, part in self.parts().items()}
-        told = [text if len(texts) == 1 else f"{name} {text}" for name, text in texts.items()]
-        return (f"resolution: {'; '.join(told)}",) if told else ()
+        lines = [text if len(texts) == 1 else f"{name} {text}" for name, text in texts.items()]
+        return (f"resolution: {'; '.join(lines)}",) if lines else ()
 
     @override
     def pixels(self, schedule: Schedule, step: int) -> float:

@@ -94,8 +94,10 @@ class Spectral(CoarseToFine):
 
     @override
     def parts(self) -> Mapping[str, Part]:
-        known = self.courses or {}
-        return {name: Part(_course(each.scales), each.photos) for name, each in known.items()}
+        courses = self.courses or {}
+        return {
+            name: Part(_course(course.scales), course.photos) for name, course in courses.items()
+        }
 
     def _groups(self, scene: Scene) -> Mapping[str, "_Group"]:
         """Return the groups of photos that share a course, by name."""
@@ -127,8 +129,8 @@ class Spectral(CoarseToFine):
         behind = np.maximum(ahead - 1, 0)
         # Before the first level is left, there is no level to interpolate from.
         share = (parts - ends[behind]) / np.where(ahead > 0, ends[ahead] - ends[behind], np.inf)
-        found = pixels[behind] + share * (pixels[ahead] - pixels[behind])
-        return tuple(np.sqrt(found).round(4).tolist())
+        areas = pixels[behind] + share * (pixels[ahead] - pixels[behind])
+        return tuple(np.sqrt(areas).round(4).tolist())
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +152,7 @@ class _Group:
         """Return the group of `views`; at most `most` spectra, evenly spread, are measured."""
         chosen = np.linspace(0, len(views) - 1, min(most, len(views))).round().astype(int)
         shorter = [min(view.camera.width, view.camera.height) for view in views]
-        kept = kept_shares([views[each] for each in chosen])
+        kept = kept_shares([views[index] for index in chosen])
         return cls(views, kept, float(np.median(shorter)))
 
 
@@ -194,10 +196,10 @@ def grey_window(image: Tensor, mask: Tensor | None) -> Floats:
         mask: [H, W] bool; None if every pixel counts.
     """
     top, left = (max(0, (size - _WINDOW) // 2) for size in image.shape[:2])
-    part = slice(top, top + _WINDOW), slice(left, left + _WINDOW)
-    grey = np.asarray(image[part].numpy().mean(axis=2, dtype=np.float64))
+    window = slice(top, top + _WINDOW), slice(left, left + _WINDOW)
+    grey = np.asarray(image[window].numpy().mean(axis=2, dtype=np.float64))
     if mask is not None:
-        counts = mask[part].numpy()
+        counts = mask[window].numpy()
         grey[~counts] = grey[counts].mean() if counts.any() else 0.0
     return grey
 

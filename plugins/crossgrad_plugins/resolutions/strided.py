@@ -44,7 +44,9 @@ class Strided(CoarseToFine):
         most = [self._most(view.camera) for view in scene.train_views]
         # An n that the user sets is used for the photos that are large enough for it.
         n = median(most) if self.coarsest is None else min(self.coarsest, max(most))
-        return self.model_copy(update={"coarsest": max(each for each in (1, 2, 4, 8) if each <= n)})
+        return self.model_copy(
+            update={"coarsest": max(stride for stride in (1, 2, 4, 8) if stride <= n)}
+        )
 
     @override
     def measured(self, scene: Scene) -> CoarseToFine:
@@ -69,8 +71,8 @@ class Strided(CoarseToFine):
         (part,), window = self.parts().values(), self.window(schedule)
         stages = zip(part.course.ends, part.course.scales, strict=True)
         ends = [(schedule.step_of(ceil(end * window)), round(1.0 / scale)) for end, scale in stages]
-        told = [f"of each {n} x {n} to step {end}" for end, n in ends]
-        if not told:
+        texts = [f"of each {n} x {n} to step {end}" for end, n in ends]
+        if not texts:
             return (
                 (
                     "resolution: all pixels from the start, because resolution.coarsest is 1: "
@@ -83,7 +85,7 @@ class Strided(CoarseToFine):
             return (f"resolution: all pixels from the start: {why} (--set resolution.until=SHARE)",)
         return (
             (
-                f"resolution: one pixel {listed(told)}, another one in each step; then all "
+                f"resolution: one pixel {listed(texts)}, another one in each step; then all "
                 "pixels (--resolution full: from the start)"
             ),
         )

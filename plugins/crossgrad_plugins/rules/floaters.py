@@ -129,7 +129,7 @@ def in_empty_space(positions: NDArray[np.float64], scene: Scene, empty: float) -
     if not views:
         return np.zeros(len(positions), dtype=np.bool_)
     depths = (view.camera.local(scene.points[view.seen])[:, 2] for view in views)
-    nearest = np.array([np.percentile(each, NEAREST) for each in depths])
+    nearest = np.array([np.percentile(view_depths, NEAREST) for view_depths in depths])
     reach = empty * np.maximum(nearest, 0.0)
     centers = np.stack([view.camera.center.numpy() for view in views])
     distance, which = cKDTree(centers).query(positions)

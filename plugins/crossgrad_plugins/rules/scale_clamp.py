@@ -53,7 +53,7 @@ class ScaleClamp(Rule):
         names, scene, ratio = context.backbone.gaussian_tensors, context.scene, self.ratio
         if context.step % EVERY or names is None:
             return None
-        positions, scales, _ = (context.parameters[each].detach() for each in names)
+        positions, scales, _ = (context.parameters[name].detach() for name in names)
         largest = scales.amax(dim=1)
         rows = (largest > log(LEAST)).nonzero().squeeze(1)
         rows = rows[_may_be_near(scene, positions[rows], torch.exp(largest[rows]) / ratio)]
@@ -81,10 +81,10 @@ def _may_be_near(scene: Scene, positions: Tensor, distances: Tensor) -> Tensor:
     is subtracted.
     """
     centers = torch.from_numpy(scene.centers).to(positions)
-    squares, of_centers = (each.square().sum(dim=1) for each in (positions, centers))
+    squares, of_centers = (points.square().sum(dim=1) for points in (positions, centers))
     nearest = [
-        torch.addmm(of_centers, some, centers.T, alpha=-2.0).amin(dim=1)
-        for some in torch.split(positions, max(1, _AT_ONCE // len(centers)))
+        torch.addmm(of_centers, chunk, centers.T, alpha=-2.0).amin(dim=1)
+        for chunk in torch.split(positions, max(1, _AT_ONCE // len(centers)))
     ]
     lost = 16.0 * torch.finfo(positions.dtype).eps * (squares + of_centers.amax())
     return distances.square() > squares + torch.cat(nearest) - lost

@@ -62,7 +62,7 @@ class WeightAveraging(Rule):
         if not isinstance(count, int):
             return None
         sums = {**held.tensors, **held.per_primitive}
-        return {name: each / count for name, each in sums.items()}
+        return {name: total / count for name, total in sums.items()}
 
 
 def _added(
@@ -72,11 +72,11 @@ def _added(
 
     Sums have the same bits for any number of threads. The sums are divided when the means are used.
     """
-    known = {**state.tensors, **state.per_primitive}
+    previous = {**state.tensors, **state.per_primitive}
     sums: tuple[dict[str, Tensor], dict[str, Tensor]] = ({}, {})
     for block in blocks:
         for name in block.tensors:
             value = parameters[name].detach()
-            sums[block.per_primitive][name] = known[name] + value if known else value.clone()
+            sums[block.per_primitive][name] = previous[name] + value if previous else value.clone()
     count = state.values.get(_COUNT, 0)
     return PluginState({_COUNT: int(str(count)) + 1}, *sums)

@@ -48,8 +48,8 @@ class FarthestPoint(Sampler):
         """Return [N, 6] the training cameras in pose space."""
         scene = context.scene
         centers = context.centers - scene.middle
-        usual = scene.robust_centers - scene.middle
-        radius = float(np.sqrt((usual**2).sum(axis=1).mean()))
+        robust = scene.robust_centers - scene.middle
+        radius = float(np.sqrt((robust**2).sum(axis=1).mean()))
         rows = [view.camera.world_to_camera[2, :3].numpy() for view in scene.train_views]
         directions = np.stack(rows).astype(np.float64)
         # Cameras at the same position differ only in direction.

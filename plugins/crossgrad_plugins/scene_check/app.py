@@ -21,22 +21,22 @@ def lines_of(path: Path, assignments: Sequence[str]) -> list[str]:
         UserError: The scene cannot be read, or it contradicts itself.
     """
     scene, reader = read_scene(configured(merged(None, {"scene": str(path)}, assignments)))
-    found = scene.check or {}
-    warnings = found.get("warnings")
-    first = [str(each) for each in warnings] if isinstance(warnings, list) else []
+    results = scene.check or {}
+    warnings = results.get("warnings")
+    first = [str(warning) for warning in warnings] if isinstance(warnings, list) else []
     notes = [*first, *(note for note in scene.notes if note not in first)]
     more = [f"and {len(notes) - _MOST} more notes"] if len(notes) > _MOST else []
-    return [*notes[:_MOST], *more, _verdict(found, len(scene.views), reader)]
+    return [*notes[:_MOST], *more, _verdict(results, len(scene.views), reader)]
 
 
-def _verdict(found: Mapping[str, object], photos: int, reader: str) -> str:
+def _verdict(results: Mapping[str, object], photos: int, reader: str) -> str:
     measured = {
-        "correlation of colours": found.get("correlation"),
-        "share of observed points inside the photos": found.get("in_frame"),
+        "correlation of colours": results.get("correlation"),
+        "share of observed points inside the photos": results.get("in_frame"),
     }
     shown = [f"{name} {value:.2f}" for name, value in measured.items() if isinstance(value, float)]
     figures = f" (median {', '.join(shown)})" if shown else ""
     return (
-        f"verdict: {found.get('verdict')}; {found.get('compared')} of {photos} photos compared "
+        f"verdict: {results.get('verdict')}; {results.get('compared')} of {photos} photos compared "
         f"with the points, reader {reader}{figures}"
     )

@@ -67,8 +67,8 @@ def every_row(names: Mapping[str, Iterable[str]]) -> tuple[Row, ...]:
 def default_row(given: Mapping[str, str], slots: Sequence[str]) -> Row:
     """Complete a combination with the default component of each slot that is not given."""
     backbone = given.get("backbone", _default("backbone"))
-    usual = {"densifier": load_component(Backbone, backbone).default_densifier, **given}
-    return tuple(usual.get(slot) or _default(slot) for slot in slots)
+    names = {"densifier": load_component(Backbone, backbone).default_densifier, **given}
+    return tuple(names.get(slot) or _default(slot) for slot in slots)
 
 
 def _default(slot: str) -> str:
@@ -117,7 +117,7 @@ def _several_views(sampler: ComponentChoice, operator: ComponentChoice) -> int |
         build(Sampler, sampler.name, sampler.options).view_counts,
         build(Operator, operator.name, operator.options).views,
     )
-    both = (k for k in range(2, 7) if all(each.admits(k) for each in counts))
+    both = (k for k in range(2, 7) if all(count.admits(k) for count in counts))
     return next(both, None)
 
 
@@ -140,7 +140,7 @@ def as_lines(refusals: Refused, rows: Sequence[Row], slots: Sequence[str] = SLOT
         places = _slots_that_decide(concerned, rows)
         deciding = [slots[i] for i in places]
         names = {tuple(row[i] for i in places) for row in concerned}
-        lines += [f"{named(each, deciding)}: {reason}" for each in names]
+        lines += [f"{named(combination, deciding)}: {reason}" for combination in names]
     return sorted(lines)
 
 
@@ -175,18 +175,18 @@ def meetings(
         usual: Completes a row in which some values are given.
         admits: Function that returns True if the components of a row can be combined.
     """
-    missing = {(i, each) for i, some in enumerate(values) if i != place for each in some}
+    missing = {(i, name) for i, names in enumerate(values) if i != place for name in names}
     for turn in range(max(map(len, values))):
-        given = dict(enumerate(some[turn % len(some)] for some in values)) | {place: value}
+        given = dict(enumerate(names[turn % len(names)] for names in values)) | {place: value}
         row = tuple(given[i] for i in range(len(values)))
         if missing.intersection(enumerate(row)) and admits(row):
             missing -= set(enumerate(row))
             yield row
-    for i, each in sorted(missing):
-        fixed = {place: value, i: each}
+    for i, name in sorted(missing):
+        fixed = {place: value, i: name}
         changes: list[dict[int, str]] = [{}]
-        changes += [{j: v} for j, some in enumerate(values) if j not in fixed for v in some]
+        changes += [{j: v} for j, names in enumerate(values) if j not in fixed for v in names]
         rows = (usual({**fixed, **change}) for change in changes)
-        found = next(filter(admits, dict.fromkeys(rows)), None)
-        if found is not None:
-            yield found
+        admitted = next(filter(admits, dict.fromkeys(rows)), None)
+        if admitted is not None:
+            yield admitted

@@ -44,14 +44,14 @@ def members_of(package: str) -> Members:
         UserError: There is no such package, none of its components takes part in training, or one
             of them cannot be combined, for example because it cannot be loaded.
     """
-    own = entries_of(package)
+    plugins = entries_of(package)
     slots = {slot: plural(slot) for slot in (*SLOTS, *FURTHER)}
-    taking_part = [entry for entry in own if entry.slot in slots.values()]
+    taking_part = [entry for entry in plugins if entry.slot in slots.values()]
     if not taking_part:
         raise UserError(
             f"package {package!r} contains no component that is used in training",
             expected=f"a component for one of the slots {listed(slots.values())}",
-            found=listed(f"{singular(entry.slot)} {entry.name}" for entry in own),
+            found=listed(f"{singular(entry.slot)} {entry.name}" for entry in plugins),
             todo="`crossgrad plugins check` checks the components of the other slots",
         )
     names: dict[str, tuple[str, ...]] = {}
@@ -73,13 +73,13 @@ def members_of(package: str) -> Members:
                 able.append(entry.name)
         names[slot] = tuple(sorted(able))
     ours = frozenset((singular(entry.slot), entry.name) for entry in taking_part)
-    origin = f"{own[0].distribution} {own[0].version}"
+    origin = f"{plugins[0].distribution} {plugins[0].version}"
     return Members(origin, names, ours, tuple(left_out))
 
 
 def _cannot_be_combined(entry: Entry) -> str:
     """Return the reason why a component is left out; empty if it is not left out."""
-    if [each.name for each in offers(entry.slot)].count(entry.name) > 1:
+    if [offer.name for offer in offers(entry.slot)].count(entry.name) > 1:
         return "two packages offer this name"
     try:
         loaded = load_entry(entry)
@@ -111,12 +111,12 @@ def combinations_of(members: Members, admits: Admits, *, full: bool) -> Iterator
     if ours:
         rows = _all_of(members, set(ours)) if full else _few_of(members, SLOTS, ours, admits)
         yield Factors(SLOTS, tuple(rows))
-    for slot, name in sorted(each for each in members.own if each[0] in FURTHER):
-        slots, place = (*SLOTS, slot), (len(SLOTS), name)
+    for slot, name in sorted(member for member in members.own if member[0] in FURTHER):
+        slots, component = (*SLOTS, slot), (len(SLOTS), name)
         if full:
             rows = ((*row, name) for row in every_row(members.names))
         else:
-            rows = _few_of(members, slots, [place], admits)
+            rows = _few_of(members, slots, [component], admits)
         yield Factors(slots, tuple(rows))
 
 
@@ -133,11 +133,11 @@ def _few_of(
     values += [(name,) for _, name in ours[: len(slots) - len(SLOTS)]]
 
     def usual(given: Mapping[int, str]) -> Row:
-        return default_row({slots[place]: name for place, name in given.items()}, slots)
+        return default_row({slots[position]: name for position, name in given.items()}, slots)
 
-    known: set[Row] = set()
-    for place, name in ours:
-        for row in meetings(place, name, values, usual, lambda row: admits(row, slots)):
-            if row not in known:
-                known.add(row)
+    yielded: set[Row] = set()
+    for position, name in ours:
+        for row in meetings(position, name, values, usual, lambda row: admits(row, slots)):
+            if row not in yielded:
+                yielded.add(row)
                 yield row

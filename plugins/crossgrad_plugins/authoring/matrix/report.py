@@ -71,8 +71,8 @@ def reason_of(error: BaseException) -> str:
     """Return an error in one line, with the source line that raised it."""
     text = f"{error.what}: {error.found}" if isinstance(error, UserError) else str(error)
     frames = traceback.extract_tb(error.__traceback__)
-    place = f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""
-    return f"{type(error).__name__}: {' '.join(text.split())}{place}"
+    source_line = f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""
+    return f"{type(error).__name__}: {' '.join(text.split())}{source_line}"
 
 
 def train_matrix(package: str, *, full: bool) -> tuple[str, bool]:
@@ -92,14 +92,14 @@ def train_matrix(package: str, *, full: bool) -> tuple[str, bool]:
     progress = Progress(_PAUSE)
     progress.tell("choosing combinations")
     designs = tuple(combinations_of(tally.members, tally.admits, full=full))
-    total = sum(len(each.rows) for each in designs)
+    total = sum(len(design.rows) for design in designs)
     done = 0
-    for each in designs:
-        for row in each.rows:
+    for design in designs:
+        for row in design.rows:
             done += 1
             progress.tell(f"combination {done} of {total}")
-            if not full or tally.admits(row, each.slots):
-                tally.train(row, each.slots)
+            if not full or tally.admits(row, design.slots):
+                tally.train(row, design.slots)
     return report(tally, package), not tally.failed and not tally.never_trained
 
 
@@ -114,10 +114,10 @@ def train_one(package: str, combination: str) -> None:
         UserError: The format is invalid, or a component is not installed.
     """
     members = members_of(package)
-    pairs = [tuple(part.split("=", 1)) for part in combination.split()]
+    pairs = [tuple(word.split("=", 1)) for word in combination.split()]
     slots = tuple(pair[0] for pair in pairs)
-    known = all(len(pair) == 2 and pair[1] in members.names.get(pair[0], ()) for pair in pairs)  # noqa: PLR2004
-    if not known or slots[: len(SLOTS)] != SLOTS or not set(slots[len(SLOTS) :]) <= {*FURTHER}:
+    installed = all(len(pair) == 2 and pair[1] in members.names.get(pair[0], ()) for pair in pairs)  # noqa: PLR2004
+    if not installed or slots[: len(SLOTS)] != SLOTS or not set(slots[len(SLOTS) :]) <= {*FURTHER}:
         raise UserError(
             "the text does not name a combination of components",
             where="--only",
@@ -130,8 +130,8 @@ def train_one(package: str, combination: str) -> None:
 
 def report(tally: Tally, package: str) -> str:
     """Return the report on trained, refused and failed combinations, in 80 columns."""
-    members, own = tally.members, tally.members.own
-    heading = f"{members.package}: {listed(f'{slot} {name}' for slot, name in sorted(own))}"
+    members, components = tally.members, tally.members.own
+    heading = f"{members.package}: {listed(f'{slot} {name}' for slot, name in sorted(components))}"
     numbers = count(len(tally.trained) - len(tally.failed), "combination")
     lines = [_filled(heading, ""), f"{numbers} trained for {STEPS} steps, twice with the same bits"]
     lines += [_filled(f"left out: {reason}", "  ") for reason in members.left_out]
@@ -152,10 +152,10 @@ def report(tally: Tally, package: str) -> str:
 
 def _refusals(rows: Refused, slots: tuple[str, ...], tally: Tally) -> list[str]:
     """Return the refusals in few lines that contain no trained combination."""
-    known = set(slots)
-    trained = [each for each in tally.trained if {slot for slot, _ in each} == known]
-    names = [dict(each) for each in trained]
-    return as_lines(rows, [*rows, *(tuple(each[slot] for slot in slots) for each in names)], slots)
+    wanted = set(slots)
+    trained = [pairs for pairs in tally.trained if {slot for slot, _ in pairs} == wanted]
+    names = [dict(pairs) for pairs in trained]
+    return as_lines(rows, [*rows, *(tuple(row[slot] for slot in slots) for row in names)], slots)
 
 
 def _filled(text: str, indent: str) -> str:

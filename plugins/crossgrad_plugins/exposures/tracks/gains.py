@@ -123,22 +123,22 @@ class TrackGains:
     @property
     def _lasting(self) -> float:
         """The spread without the photo farthest from the mean, if there are enough photos."""
-        known = self.gains[self.known]
-        if len(known) < _ENOUGH:
+        gains = self.gains[self.known]
+        if len(gains) < _ENOUGH:
             return self.spread
-        return float(np.delete(known, np.argmax(np.abs(known - known.mean()))).std())
+        return float(np.delete(gains, np.argmax(np.abs(gains - gains.mean()))).std())
 
     @property
     def evidence(self) -> str:
         """The values that the rule compares, as text."""
-        known = self.gains[self.known]
-        if not len(known):
+        gains = self.gains[self.known]
+        if not len(gains):
             return "no SfM tracks connect the photos, so their brightness cannot be compared"
         error = f", standard error {self.error:.2f}" if isfinite(self.error) else ""
         return (
-            f"brightness of {len(known)} photos at {int(self.counts.sum()):,} "
+            f"brightness of {len(gains)} photos at {int(self.counts.sum()):,} "
             "observations of SfM points: gains with a standard deviation of "
-            f"{self.spread:.2f} stops ({known.min():+.2f} to {known.max():+.2f}{error}); "
+            f"{self.spread:.2f} stops ({gains.min():+.2f} to {gains.max():+.2f}{error}); "
             "where points connect photos of different gains, the gains reduce the "
             f"deviation by {100.0 * self.fit.reduction:.0f} % ({self.fit.before:.2f} to "
             f"{self.fit.after:.2f} stops)"
@@ -157,10 +157,10 @@ def track_gains(scene: Scene, views: Sequence[View]) -> TrackGains:
 
 def training_gains(scene: Scene) -> TrackGains:
     """Return the gains of all training photos; computed once per scene."""
-    found = _OF_TRAINING.get(scene)
-    if found is None:
-        found = _OF_TRAINING[scene] = track_gains(scene, scene.train_views)
-    return found
+    gains = _OF_TRAINING.get(scene)
+    if gains is None:
+        gains = _OF_TRAINING[scene] = track_gains(scene, scene.train_views)
+    return gains
 
 
 def deciding_gains(scene: Scene) -> TrackGains:
@@ -168,12 +168,12 @@ def deciding_gains(scene: Scene) -> TrackGains:
     views = scene.train_views
     if len(views) <= MOST_DECIDING:
         return training_gains(scene)
-    found = _DECIDING.get(scene)
-    if found is None:
+    gains = _DECIDING.get(scene)
+    if gains is None:
         period = _CONSECUTIVE * len(views) // MOST_DECIDING
         chosen = [view for row, view in enumerate(views) if row % period < _CONSECUTIVE]
-        found = _DECIDING[scene] = track_gains(scene, chosen[:MOST_DECIDING])
-    return found
+        gains = _DECIDING[scene] = track_gains(scene, chosen[:MOST_DECIDING])
+    return gains
 
 
 def fitted(observations: Observations, photos: int) -> Fit:
@@ -278,8 +278,8 @@ def _normal_matrix(o: Observations, weights: _Floats, count: int) -> "csc_array"
     of_points = np.bincount(o.points, weights)
     weight = coo_array((weights, (o.photos, o.points)), shape=(count, len(of_points))).tocsr()
     every = np.arange(count)
-    own = coo_array((np.bincount(o.photos, weights, count), (every, every)))
-    return (own.tocsr() - (weight * (1.0 / of_points)) @ weight.T).tocsc()
+    diagonal = coo_array((np.bincount(o.photos, weights, count), (every, every)))
+    return (diagonal.tocsr() - (weight * (1.0 / of_points)) @ weight.T).tocsc()
 
 
 def _iterated(o: Observations, weights: _Floats, start: _Floats) -> _Floats:

@@ -53,15 +53,15 @@ def observations_of(scene: Scene, views: Sequence[View]) -> Observations:
     """
     shared = _shared_points(scene, views)
     with ThreadPoolExecutor(_AT_ONCE) as pool:
-        found = list(pool.map(lambda view: _observed(scene, view, shared), views))
-    photos = np.repeat(np.arange(len(views)), [len(rows) for rows, _ in found])
-    rows = np.concatenate([np.zeros(0, dtype=np.int64), *(rows for rows, _ in found)])
-    stops = np.concatenate([np.zeros(0), *(stops for _, stops in found)])
+        observed = list(pool.map(lambda view: _observed(scene, view, shared), views))
+    photos = np.repeat(np.arange(len(views)), [len(rows) for rows, _ in observed])
+    rows = np.concatenate([np.zeros(0, dtype=np.int64), *(rows for rows, _ in observed)])
+    stops = np.concatenate([np.zeros(0), *(stops for _, stops in observed)])
     # A point that is usable in only one photo gives no information about that photo.
     _, numbers, times = np.unique(rows, return_inverse=True, return_counts=True)
     kept = times[numbers] > 1
-    known, numbers = np.unique(rows[kept], return_inverse=True)
-    return Observations(photos[kept], numbers, stops[kept], known)
+    usable_rows, numbers = np.unique(rows[kept], return_inverse=True)
+    return Observations(photos[kept], numbers, stops[kept], usable_rows)
 
 
 def _shared_points(scene: Scene, views: Sequence[View]) -> NDArray[np.bool_]:
@@ -89,9 +89,9 @@ def _observed(
         image, mask = photo.image(), photo.mask()
     except UserError:
         return seen[:0], np.zeros(0)
-    found = light_at(image, mask, view.camera, scene.points[seen])
-    rows = found.rows[found.usable]
-    return seen[rows], np.log2(found.brightness[found.usable])
+    samples = light_at(image, mask, view.camera, scene.points[seen])
+    rows = samples.rows[samples.usable]
+    return seen[rows], np.log2(samples.brightness[samples.usable])
 
 
 @dataclass(frozen=True, eq=False)

@@ -93,12 +93,12 @@ def by_id(cameras: Iterable[tuple[int, Calibration]], path: Path) -> dict[int, C
     Raises:
         UserError: Two cameras have the same id.
     """
-    found: dict[int, Calibration] = {}
+    calibrations: dict[int, Calibration] = {}
     for camera, calibration in cameras:
-        if camera in found:
+        if camera in calibrations:
             raise _twice("cameras", camera, path)
-        found[camera] = calibration
-    return found
+        calibrations[camera] = calibration
+    return calibrations
 
 
 def check_point_ids(ids: NDArray[np.uint64], path: Path) -> None:

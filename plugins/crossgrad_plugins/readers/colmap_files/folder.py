@@ -15,12 +15,12 @@ def find_models(scene: Path) -> list[Path]:
 
     Models in `colmap/sparse` are included. The models are sorted by number.
     """
-    found = []
+    models = []
     for parent in (scene / name for name in _PARENTS):
         if parent.is_dir():
             below = sorted((p for p in parent.iterdir() if p.is_dir()), key=_by_number)
-            found += [folder for folder in (*below, parent) if has_model(folder)]
-    return found or ([scene] if has_model(scene) else [])
+            models += [folder for folder in (*below, parent) if has_model(folder)]
+    return models or ([scene] if has_model(scene) else [])
 
 
 def choose_model(scene: Path, wanted: str | None) -> tuple[Path, list[str]]:
@@ -88,8 +88,8 @@ def check_scene_folder(scene: Path) -> None:
 
 
 def _check_not_within_sparse(scene: Path) -> None:
-    place = scene.absolute()
-    within = [parent for parent in (place, place.parent) if parent.name == "sparse"]
+    folder = scene.absolute()
+    within = [parent for parent in (folder, folder.parent) if parent.name == "sparse"]
     if within and not (scene / "images").is_dir():
         raise UserError(
             "the path points to a folder inside a scene",
@@ -125,4 +125,4 @@ def _no_model(scene: Path) -> UserError:
 
 def _by_number(path: Path) -> list[tuple[int, str]]:
     """Return a sort key that places 10 after 9."""
-    return [(int(part or 0), part) for part in re.split(r"\D+", path.name)]
+    return [(int(digits or 0), digits) for digits in re.split(r"\D+", path.name)]

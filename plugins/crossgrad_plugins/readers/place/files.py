@@ -53,18 +53,18 @@ def of_list(path: Path, names: Collection[str]) -> Measured:
     """
     first, *lines = [line.split() for line in _text(path).splitlines()] or [[]]
     rows = {words[0]: _row(path, i, words) for i, words in enumerate(lines, 2) if words}
-    known, to_degrees = _by_file(names), _system(" ".join(first), path)
-    photos = {name: known[name] for name in rows if name in known}
-    loose, others = _by_file(names, _folded), [name for name in rows if name not in known]
+    exact, to_degrees = _by_file(names), _system(" ".join(first), path)
+    photos = {name: exact[name] for name in rows if name in exact}
+    loose, others = _by_file(names, _folded), [name for name in rows if name not in exact]
     times = Counter(map(_folded, others))
     for name in others:
         # An ambiguous name is ignored, and an exact name of the same photo takes precedence.
         photo = loose.get(_folded(name)) if times[_folded(name)] == 1 else None
         if photo is not None and photo not in photos.values():
             photos[name] = photo
-    found = ((photo, to_degrees(rows[name])) for name, photo in photos.items())
+    positions = ((photo, to_degrees(rows[name])) for name, photo in photos.items())
     strangers = tuple(name for name in rows if name not in photos)
-    return replace(measured(found, path.name), strangers=strangers)
+    return replace(measured(positions, path.name), strangers=strangers)
 
 
 def _text(path: Path) -> str:
@@ -102,11 +102,11 @@ def _by_file(names: Collection[str], said: Callable[[str], str] = str) -> dict[s
     """Return the photos of the names in `said`: by whole name, or by file name if it is unique."""
     files = {name: said(PurePosixPath(name).name) for name in names}
     whole = {name: said(name) for name in names}
-    found: dict[str, str] = {}
+    photos: dict[str, str] = {}
     for called in (files, whole):
         often = Counter(called.values())
-        found |= {text: name for name, text in called.items() if often[text] == 1}
-    return found
+        photos |= {text: name for name, text in called.items() if often[text] == 1}
+    return photos
 
 
 def _system(text: str, path: Path) -> Callable[[Numbers], Numbers | None]:
@@ -146,12 +146,12 @@ def of_priors(path: Path, names: Collection[str]) -> Measured:
     """
     try:
         # With `immutable`, SQLite writes no file of its own next to the database.
-        place = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
-        with closing(sqlite3.connect(place, uri=True)) as database:
+        uri = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
+        with closing(sqlite3.connect(uri, uri=True)) as database:
             database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST)
             rows = _positions(database, frozenset(names), path.stat().st_size)
-            found = ((name, _numbers(blob)) for name, blob in rows)
-            return measured(found, f"priors in {path.name}")
+            positions = ((name, _numbers(blob)) for name, blob in rows)
+            return measured(positions, f"priors in {path.name}")
     except (sqlite3.Error, OSError, UnicodeError) as error:
         raise UserError(
             "the COLMAP database cannot be read",
@@ -172,8 +172,8 @@ def _positions(
         most: Greatest number of rows read from a table. The number is limited because damaged pages
             can form an endless cycle.
     """
-    found = database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
-    tables = {row[0] for row in islice(found, most)}
+    table_rows = database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
+    tables = {row[0] for row in islice(table_rows, most)}
     # A view of the database may compute without an end.
     if not {"images", "pose_priors"} <= tables:
         return

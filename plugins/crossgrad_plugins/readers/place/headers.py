@@ -43,20 +43,20 @@ def of_headers(files: Mapping[str, Path], source: str) -> Measured:
 
 def measured(found: Iterable[tuple[str, Numbers | None]], source: str) -> Measured:
     """Return the valid places among the GPS numbers of photos."""
-    known: dict[str, Numbers] = {}
+    valid: dict[str, Numbers] = {}
     flat = 0
     for name, numbers in found:
         if numbers is None or not is_place(*numbers[:2]):
             continue
         if math.isfinite(numbers[2]):
-            known[name] = numbers
+            valid[name] = numbers
         else:
             flat += 1
-    if not known:
+    if not valid:
         return Measured(source, flat=flat)
     from crossgrad_plugins.georeference.ellipsoid import Place
 
-    return Measured(source, {name: Place(*numbers) for name, numbers in known.items()}, flat)
+    return Measured(source, {name: Place(*numbers) for name, numbers in valid.items()}, flat)
 
 
 def _header(path: Path) -> Numbers | None:

@@ -64,10 +64,10 @@ def by_gps(scene: Scene, raw: RawScene, named: Path | None = None) -> Scene:
             elif named is not None:
                 notes.append(f"{measured.source}: it contains no position for a photo of the scene")
             continue
-        found = _fitted(scene, shown, measured)
-        if not isinstance(found, str):
-            return at(replace(scene, notes=(*scene.notes, *notes)), found)
-        notes.append(found)
+        outcome = _fitted(scene, shown, measured)
+        if not isinstance(outcome, str):
+            return at(replace(scene, notes=(*scene.notes, *notes)), outcome)
+        notes.append(outcome)
     if not notes:
         return scene
     return at(scene, Unplaced("; ".join(notes)))
@@ -132,7 +132,7 @@ def _fitted(scene: Scene, views: list[View], measured: Measured) -> "OnEarth | s
     from crossgrad_plugins.georeference.on_earth import OnEarth
 
     places = [measured.places[view.name] for view in views]
-    numbers = np.array([[each.latitude, each.longitude, each.altitude] for each in places])
+    numbers = np.array([[place.latitude, place.longitude, place.altitude] for place in places])
     earth = geocentric(numbers)
     origin = place_at(np.median(earth, axis=0)) or places[0]
     fit = fit_similarity(_centers(scene, views), origin.to_enu.points(earth))
@@ -208,9 +208,9 @@ def by_file(scene: Scene, file: Path) -> Scene:
     if frame is None:
         expected = "rows of a right-handed similarity, the last one 0, 0, 0, 1"
         fields.wrong("transform", expected)
-    told = fields.inner("residuals_m") if "residuals_m" in fields else Fields({}, file)
+    stored = fields.inner("residuals_m") if "residuals_m" in fields else Fields({}, file)
     scene = replace(scene, files=(*scene.files, file))
-    residuals = {name: told.number(name) for name in RESIDUALS if name in told}
+    residuals = {name: stored.number(name) for name in RESIDUALS if name in stored}
     return at(scene, OnEarth(origin_of(fields.inner("origin")), frame, file.name, residuals))
 
 
