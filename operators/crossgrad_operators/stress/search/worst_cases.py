@@ -125,8 +125,8 @@ def _worst(pool: list[Sample], batch: Batch, values: Sequence[float], turn: int)
     """Return the worst cases of a pool and a batch together."""
     last = pool[-1].value if len(pool) == POOL else 0.0
     ranked = sorted(range(len(values)), key=lambda index: -values[index])
-    places = [index for index in ranked[:2] if values[index] > last]
-    if not places:
+    worst = [index for index in ranked[:2] if values[index] > last]
+    if not worst:
         return pool
-    specimens = [specimen(batch, index, turn, values[index]) for index in places]
+    specimens = [specimen(batch, index, turn, values[index]) for index in worst]
     return sorted([*pool, *specimens], key=lambda sample: -sample.value)[:POOL]
