@@ -168,17 +168,19 @@ class DistanceConditioned(Vanilla):
 
     def _conditioned(self) -> tuple[Conditioned, ...]:
         chosen = (self.condition_scales, self.condition_opacities, self.condition_colors)
-        each = zip((SCALES, OPACITIES, COLORS), chosen, strict=True)
-        return tuple(conditioned for conditioned, wanted in each if wanted)
+        choices = zip((SCALES, OPACITIES, COLORS), chosen, strict=True)
+        return tuple(conditioned for conditioned, wanted in choices if wanted)
 
     @override
     def blocks(self) -> tuple[Block, ...]:
         plain = {block.name: block for block in super().blocks()}
         weights = []
-        for each in self._conditioned():
-            base = plain[each.base]
+        for conditioned in self._conditioned():
+            base = plain[conditioned.base]
             rate = LearningRate(self.lr_share * base.lr.initial, few_passes=base.lr.few_passes)
-            weights.append(Block(each.weights, (each.weights,), True, base.kind, rate))
+            weights.append(
+                Block(conditioned.weights, (conditioned.weights,), True, base.kind, rate)
+            )
         scale = Block(SCALE, (SCALE,), False, "neutral", LearningRate(0.0))
         return (*plain.values(), *weights, scale)
 
@@ -209,8 +211,8 @@ class DistanceConditioned(Vanilla):
     def _conditionable(self, parameters: Parameters, scene: Scene) -> Parameters:
         rows = parameters["means"].shape[0]
         weights = {
-            each.weights: torch.zeros(rows, *each.shape).requires_grad_()
-            for each in self._conditioned()
+            conditioned.weights: torch.zeros(rows, *conditioned.shape).requires_grad_()
+            for conditioned in self._conditioned()
         }
         return {**parameters, **weights, SCALE: _scale_of(scene)}
 
@@ -224,15 +226,16 @@ class DistanceConditioned(Vanilla):
         """Return the parameters of vanilla for the mean encoding of these cameras."""
         encoding = encoded(parameters[SCALE], cameras).to(parameters["means"])
         sums = {
-            each.base: parameters[each.base] + added(parameters[each.weights], encoding)
-            for each in self._conditioned()
+            conditioned.base: parameters[conditioned.base]
+            + added(parameters[conditioned.weights], encoding)
+            for conditioned in self._conditioned()
         }
         return {**parameters, **sums}
 
     @hookimpl
     def crossgrad_regularize(self, context: RegularizeContext) -> RegularizeResult | None:
         """Return both penalties on the weights, once per step."""
-        names = [each.weights for each in self._conditioned()]
+        names = [conditioned.weights for conditioned in self._conditioned()]
         if context.gaussians is not None or not names:
             return None
         penalties = [

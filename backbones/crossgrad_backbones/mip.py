@@ -74,8 +74,8 @@ def smoothed(log_scales: Tensor, logits: Tensor, widths: Tensor) -> tuple[Tensor
         logits: [N] logits of o.
         widths: [N] standard deviations w; they get no gradient.
     """
-    found: tuple[Tensor, Tensor] = _Smoothed.apply(log_scales, logits, widths)  # type: ignore[no-untyped-call]
-    return found
+    scales_and_opacities: tuple[Tensor, Tensor] = _Smoothed.apply(log_scales, logits, widths)  # type: ignore[no-untyped-call]
+    return scales_and_opacities
 
 
 class _Smoothed(torch.autograd.Function):

@@ -79,7 +79,7 @@ def init_anchors(points: NDArray[np.float64], lattice: Lattice, *, everywhere: b
     """
     origin = lattice.origin.numpy()
     levels = torch.arange(lattice.count)
-    found, coarser = [], np.zeros(0, np.int64)
+    by_level, coarser = [], np.zeros(0, np.int64)
     for level, cell in enumerate(lattice.cells(levels).tolist()):
         sites, site = np.unique(np.round((points - origin) / cell), axis=0, return_inverse=True)
         site = site.reshape(-1)
@@ -89,11 +89,11 @@ def init_anchors(points: NDArray[np.float64], lattice: Lattice, *, everywhere: b
         if level > 0 and not everywhere:
             rows = np.unique(site[_parted(coarser, site)])
         numbers = np.full(len(rows), level)
-        found.append(
-            [torch.from_numpy(each) for each in (positions[rows], numbers, spacings[rows])]
+        by_level.append(
+            [torch.from_numpy(column) for column in (positions[rows], numbers, spacings[rows])]
         )
         coarser = site
-    return Planted(*(torch.cat(each) for each in zip(*found, strict=True)))
+    return Planted(*(torch.cat(column) for column in zip(*by_level, strict=True)))
 
 
 def _parted(coarser: NDArray[np.int64], site: NDArray[np.int64]) -> NDArray[np.bool_]:

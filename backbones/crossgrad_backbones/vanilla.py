@@ -121,8 +121,8 @@ class Vanilla(Backbone):
         """Return the initial opacity logits [P]."""
         opacities = np.full(len(scene.points), self.initial_opacity)
         if scene.point_opacities is not None:
-            known = ~np.isnan(scene.point_opacities)
-            opacities[known] = scene.point_opacities[known]
+            has_opacity = ~np.isnan(scene.point_opacities)
+            opacities[has_opacity] = scene.point_opacities[has_opacity]
         return np.log(opacities / (1.0 - opacities))
 
     @override

@@ -36,8 +36,8 @@ def remember(
         return PluginState(state.values, tensors, rows_of)
     first = 0
     for name, rows in _runs(context):
-        part = torch.from_numpy(values[first : first + rows].copy())
-        (rows_of if rows > 1 else tensors)[f"{key}/{name}"] = part
+        block_values = torch.from_numpy(values[first : first + rows].copy())
+        (rows_of if rows > 1 else tensors)[f"{key}/{name}"] = block_values
         first += rows
     return PluginState(state.values, tensors, rows_of)
 
@@ -46,8 +46,8 @@ def _known(kept: torch.Tensor | None, shape: tuple[int, ...]) -> NDArray[np.floa
     """Return a copy of the stored values, or zeros if they are missing."""
     if kept is None or tuple(kept.shape) != shape:
         return np.zeros(shape)
-    known: NDArray[np.float64] = kept.cpu().numpy().astype(np.float64)
-    return known
+    stored: NDArray[np.float64] = kept.cpu().numpy().astype(np.float64)
+    return stored
 
 
 def _by_block(context: OperatorContext) -> bool:

@@ -56,12 +56,15 @@ OperatorField: TypeAlias = Annotated[
 
 def reads_gramians(operators: Iterable[MatrixOperator]) -> bool:
     """Return True if any of these operators depends on the Gramians."""
-    return any(isinstance(each, GramianOperator) and each.reads_gramians() for each in operators)
+    return any(
+        isinstance(operator, GramianOperator) and operator.reads_gramians()
+        for operator in operators
+    )
 
 
 def first_grouping(operators: Iterable[MatrixOperator]) -> str | None:
     """Return the grouping of the first operator that needs a grouping, or None."""
-    return next(filter(None, (each.resolved_grouping for each in operators)), None)
+    return next(filter(None, (operator.resolved_grouping for operator in operators)), None)
 
 
 def inner_state(state: PluginState, key: str) -> PluginState:
@@ -87,18 +90,18 @@ def inner_objections(selection: Selection, operator: Operator) -> list[str]:
     """Return the objections of an inner operator to a selection."""
     name = component_name(operator)
     seen = replace(selection, operator=operator, names={**selection.names, "operator": name})
-    own = getattr(operator, "crossgrad_validate_selection", None)
-    return objections_to_views(operator, seen) + list(own(seen) or () if own else ())
+    validate = getattr(operator, "crossgrad_validate_selection", None)
+    return objections_to_views(operator, seen) + list(validate(seen) or () if validate else ())
 
 
 def inner_idle(selection: Selection, option: str, operators: Iterable[Operator]) -> dict[str, str]:
     """Return a message for the option with inner operators, if their options have no effect."""
-    found = [
+    messages = [
         f"{component_name(operator)}.{name}: {why}"
         for operator in operators
         for name, why in set_for_nothing(operator, selection).items()
     ]
-    return {option: "; ".join(found)} if found else {}
+    return {option: "; ".join(messages)} if messages else {}
 
 
 def _inner(values: Mapping[str, Any], start: str) -> dict[str, Any]:

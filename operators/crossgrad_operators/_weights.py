@@ -38,9 +38,9 @@ def refine(
         `weights`.
     """
     if context.rounding_residuals is not None and ill_conditioned.any():
-        part = np.flatnonzero(ill_conditioned)
-        weights[part] = exact(
-            gramians[part], context.rounding_residuals()[part], context.present[part]
+        blocks = np.flatnonzero(ill_conditioned)
+        weights[blocks] = exact(
+            gramians[blocks], context.rounding_residuals()[blocks], context.present[blocks]
         )
     return weights
 
@@ -64,8 +64,8 @@ def doubted(kernel: CautiousKernel, gramians: Floats, context: OperatorContext) 
     nothing = np.zeros_like(gramians)
     weights, ill_conditioned = kernel(gramians, nothing, context.present, context.unit, None)
 
-    def exact(part: Floats, rounding_residuals: Floats, present: Flags) -> Floats:
-        return kernel(part, rounding_residuals, present, context.unit, True)[0]
+    def exact(chosen_gramians: Floats, rounding_residuals: Floats, present: Flags) -> Floats:
+        return kernel(chosen_gramians, rounding_residuals, present, context.unit, True)[0]
 
     return refine(weights, ill_conditioned, gramians, context, exact)
 
@@ -93,7 +93,7 @@ def extended_precision(kernel: Kernel, gramians: Floats, context: OperatorContex
         return kernel(gramians, context.rounding_residuals(), context.present, True)[0]
     weights, ill_conditioned = kernel(gramians, np.zeros_like(gramians), context.present, None)
 
-    def exact(part: Floats, rounding_residuals: Floats, present: Flags) -> Floats:
-        return kernel(part, rounding_residuals, present, True)[0]
+    def exact(chosen_gramians: Floats, rounding_residuals: Floats, present: Flags) -> Floats:
+        return kernel(chosen_gramians, rounding_residuals, present, True)[0]
 
     return refine(weights, ill_conditioned, gramians, context, exact)

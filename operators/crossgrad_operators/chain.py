@@ -82,10 +82,10 @@ class Chain(GramianOperator):
         product = np.tile(np.eye(views), (blocks, 1, 1))
         seen, seen_context = gramians, context
         states = {}
-        for place, link in enumerate(self.links):
+        for position, link in enumerate(self.links):
             if seen.shape[1] != views:
-                raise _reshaped(self.links[place - 1], seen.shape[1], views)
-            key = str(place)
+                raise _reshaped(self.links[position - 1], seen.shape[1], views)
+            key = str(position)
             inner = inner_state(state, key)
             matrices, states[key] = transformed(link, seen, seen_context, inner, rng)
             product = matrices @ product

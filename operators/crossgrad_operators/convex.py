@@ -66,9 +66,12 @@ class CAGrad(Weighting):
         from crossgrad_operators.numba_kernels.simplex import cagrad
 
         def kernel(
-            part: Floats, rounding_residuals: Floats, present: Flags, exact: Literal[True] | None
+            block_gramians: Floats,
+            rounding_residuals: Floats,
+            present: Flags,
+            exact: Literal[True] | None,
         ) -> tuple[Floats, Flags]:
-            return cagrad(part, rounding_residuals, present, exact, self.c)
+            return cagrad(block_gramians, rounding_residuals, present, exact, self.c)
 
         weights = extended_precision(kernel, gramians, context)
         several = context.present.sum(axis=1, keepdims=True) > 1

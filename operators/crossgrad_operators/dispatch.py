@@ -82,7 +82,7 @@ class Dispatch(GramianOperator):
 
     @override
     def needs_more_views(self, views: int) -> bool:
-        return any(each.needs_more_views(views) for each in self._operators().values())
+        return any(operator.needs_more_views(views) for operator in self._operators().values())
 
     @property
     @override
@@ -138,13 +138,15 @@ class Dispatch(GramianOperator):
         matrices = np.zeros(gramians.shape)
         states = {}
         for key in dict.fromkeys(served.tolist()):
-            part = np.flatnonzero(served == key)
-            inner, of_part = inner_state(state, key), _part(context, part)
-            found, states[key] = transformed(operators[key], gramians[part], of_part, inner, rng)
+            block_indices = np.flatnonzero(served == key)
+            inner, of_part = inner_state(state, key), _part(context, block_indices)
+            block_matrices, states[key] = transformed(
+                operators[key], gramians[block_indices], of_part, inner, rng
+            )
             # Rows are added at the end, so their number does not matter here.
-            if found.shape[1] != gramians.shape[1]:
-                found = _in_first_row(found, gramians.shape[1])
-            matrices[part] = found
+            if block_matrices.shape[1] != gramians.shape[1]:
+                block_matrices = _in_first_row(block_matrices, gramians.shape[1])
+            matrices[block_indices] = block_matrices
         return matrices, outer_state(states)
 
     @hookimpl
@@ -163,9 +165,9 @@ class Dispatch(GramianOperator):
         blocks = [block.name for block in selection.backbone.trained_blocks()]
         for rule in self.rules:
             if rule.block not in (*_KINDS, *blocks):
-                known = ", ".join((*_KINDS, *blocks))
+                names = ", ".join((*_KINDS, *blocks))
                 reasons.append(
-                    f"dispatch has a rule for {rule.block!r}, but the blocks and kinds are {known}"
+                    f"dispatch has a rule for {rule.block!r}, but the blocks and kinds are {names}"
                 )
         return reasons
 
@@ -194,14 +196,14 @@ class Dispatch(GramianOperator):
         return self.opacity if name in _OPACITY else kind
 
 
-def _part(context: OperatorContext, part: NDArray[np.int64]) -> OperatorContext:
+def _part(context: OperatorContext, block_indices: NDArray[np.int64]) -> OperatorContext:
     whole = context.rounding_residuals
     return replace(
         context,
-        blocks=tuple(context.blocks[b] for b in part),
-        kinds=tuple(context.kinds[b] for b in part),
-        present=context.present[part],
-        rounding_residuals=None if whole is None else lambda: whole()[part],
+        blocks=tuple(context.blocks[b] for b in block_indices),
+        kinds=tuple(context.kinds[b] for b in block_indices),
+        present=context.present[block_indices],
+        rounding_residuals=None if whole is None else lambda: whole()[block_indices],
     )
 
 

@@ -99,8 +99,8 @@ class GradNorm(GramianOperator):
     def _rates(self, losses: _Losses) -> NDArray[np.float64]:
         """Return the relative losses l_s [S], or 1 until every group has an initial loss."""
         newest = [_at(group, group.get("octave", 0), 0.0) for group in losses.values()]
-        known = all(s["count"] >= self.baseline and s["start"] > 0 for s in newest)
-        if not known:
+        have_started = all(s["count"] >= self.baseline and s["start"] > 0 for s in newest)
+        if not have_started:
             return np.ones(len(losses))
         return np.array([s["average"] / s["start"] for s in newest])
 
@@ -115,5 +115,7 @@ def _at(group: dict[str, Any], level: int, loss: float) -> dict[str, Any]:
         group.pop("octave", None)
         return group
     group["octave"] = level
-    found: dict[str, Any] = group.setdefault("octaves", {}).setdefault(str(level), _fresh(loss))
-    return found
+    octave_losses: dict[str, Any] = group.setdefault("octaves", {}).setdefault(
+        str(level), _fresh(loss)
+    )
+    return octave_losses

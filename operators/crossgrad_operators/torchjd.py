@@ -65,9 +65,9 @@ class TorchJD(GramianOperator):
             for block, present in enumerate(context.present):
                 chosen = np.flatnonzero(present)
                 if chosen.size:
-                    part = gramians[block][np.ix_(chosen, chosen)]
-                    found = rule(torch.from_numpy(part / np.trace(part)))
-                    weights[block, chosen] = found.double().numpy()
+                    gramian = gramians[block][np.ix_(chosen, chosen)]
+                    block_weights = rule(torch.from_numpy(gramian / np.trace(gramian)))
+                    weights[block, chosen] = block_weights.double().numpy()
         return diagonals(weights), state
 
     def _built(self) -> Any:  # noqa: ANN401 - TorchJD may be absent
@@ -79,24 +79,24 @@ class TorchJD(GramianOperator):
                 todo='install it: pip install "crossgrad[torchjd]"',
             ) from None
         name = self.weighting.removesuffix("Weighting") + "Weighting"
-        found = getattr(aggregation, name, None)
-        if found is None:
-            known = sorted(
+        weighting = getattr(aggregation, name, None)
+        if weighting is None:
+            names = sorted(
                 n.removesuffix("Weighting") for n in dir(aggregation) if "Weighting" in n
             )
             raise UserError(
                 f"TorchJD has no weighting named {self.weighting!r}",
                 where="operator.weighting",
-                expected=f"one of {', '.join(filter(None, known))}",
+                expected=f"one of {', '.join(filter(None, names))}",
                 todo="choose one of these weightings with --set operator.weighting=NAME",
             )
-        if hasattr(found, "reset"):
+        if hasattr(weighting, "reset"):
             raise UserError(
                 f"TorchJD's {name} stores state between steps, so that a run could not be resumed",
                 where="operator.weighting",
                 todo="use crossgrad's operator of the same name, or another weighting",
             )
-        return self._called(found)
+        return self._called(weighting)
 
     def _called(self, kind: Any) -> Any:  # noqa: ANN401
         try:

@@ -54,7 +54,7 @@ def in_frustum(positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
     Source: Scaffold-GS, section 3.2 (view-frustum filtering).
     """
     tensors = (positions, log_scales)
-    if all(each.device.type == "cpu" and each.dtype == torch.float32 for each in tensors):
+    if all(tensor.device.type == "cpu" and tensor.dtype == torch.float32 for tensor in tensors):
         return _fused(positions, log_scales, camera)
     return _plain(positions, log_scales, camera)
 
@@ -83,8 +83,8 @@ def _plain(positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
         row = axis[:3] - slope.clamp(least, most)[:, None] * pose[2, :3]
         variance = (row.square() * squares).sum(1) * (focal / depth).square() + DILATION
         extent = REACH * variance.sqrt()
-        place = focal * slope + center
-        inside &= (place + extent >= first) & (place - extent <= last)
+        projected = focal * slope + center
+        inside &= (projected + extent >= first) & (projected - extent <= last)
     return inside
 
 

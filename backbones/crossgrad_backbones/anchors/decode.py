@@ -71,25 +71,25 @@ class _Back:
         weight = inputs.first[0][mine, :feature]
         whole, buffer = array(kept.hidden), array(self.hidden)
         anchors = len(kept.tanhs)
-        for part in stretches(len(kept.hidden)):
-            rows, count = part.stop - part.start, min(part.stop, anchors) - part.start
-            fill(part.start, count)
+        for stretch in stretches(len(kept.hidden)):
+            rows, count = stretch.stop - stretch.start, min(stretch.stop, anchors) - stretch.start
+            fill(stretch.start, count)
             self.raw[count:rows] = 0.0
             hidden = self.hidden[:rows]
-            self._second(inputs, kept.hidden[part, mine], self.raw[:rows], hidden)
-            parallel(layers.rectify_back, part.start, rows, begin, whole, buffer)
-            self.first[0][mine] += product(hidden, kept.joined[part])
+            self._second(inputs, kept.hidden[stretch, mine], self.raw[:rows], hidden)
+            parallel(layers.rectify_back, stretch.start, rows, begin, whole, buffer)
+            self.first[0][mine] += product(hidden, kept.joined[stretch])
             self.first[1][mine] += hidden.sum(0)
-            owners = inputs.view.feature_rows[part]
+            owners = inputs.view.feature_rows[stretch]
             self.features.index_copy_(0, owners, hidden[:count] @ weight)
 
     def _second(self, inputs: Inputs, hidden: Tensor, raw: Tensor, out: Tensor) -> None:
         """Compute gradients of the hidden layers [n, H of all heads] and of the second layers."""
         width, at = self.second[0].shape[1], 0
-        for place, head in enumerate(self.heads):
+        for index, head in enumerate(self.heads):
             weight = inputs.second[head][0]
             outputs = slice(at, at + len(weight))
-            columns = slice(place * width, (place + 1) * width)
+            columns = slice(index * width, (index + 1) * width)
             self.second[0][outputs] += product(raw[:, outputs], hidden[:, columns])
             torch.mm(raw[:, outputs], weight, out=out[:, columns])
             at = outputs.stop
@@ -97,12 +97,12 @@ class _Back:
 
     def by_second(self, inputs: Inputs) -> list[Tensor | None]:
         """Return gradients of weight and bias of the three second layers; None for unused heads."""
-        found: list[Tensor | None] = [None] * (2 * len(_HEADS))
+        gradients: list[Tensor | None] = [None] * (2 * len(_HEADS))
         sizes = [len(inputs.second[head][1]) for head in self.heads]
-        weights, biases = (torch.split(each, sizes) for each in self.second)
+        weights, biases = (torch.split(gradient, sizes) for gradient in self.second)
         for head, weight, bias in zip(self.heads, weights, biases, strict=True):
-            found[2 * head : 2 * head + 2] = weight, bias
-        return found
+            gradients[2 * head : 2 * head + 2] = weight, bias
+        return gradients
 
 
 def backward(inputs: Inputs, kept: Kept, given: Gradients) -> Gradients:
@@ -118,7 +118,7 @@ def backward(inputs: Inputs, kept: Kept, given: Gradients) -> Gradients:
         second layer. If only the scales have a gradient (volume regularisation), the gradients of
         the offsets and of the other two networks are None and cost nothing.
     """
-    alone = all((each is not None) == (i == _SCALES) for i, each in enumerate(given))
+    alone = all((gradient is not None) == (i == _SCALES) for i, gradient in enumerate(given))
     back = _Back.of(inputs, kept, (_COVARIANCE,) if alone else _HEADS)
     by_log_scales = torch.zeros_like(inputs.log_scales)
     by_offsets = None if alone else torch.zeros_like(inputs.offsets)
@@ -220,7 +220,7 @@ def _fusible(parameters: Mapping[str, Tensor]) -> bool:
     """Return True if fused decoding is possible: float32 on the CPU, and fixed anchors."""
     names = ("anchors", "offsets", "features", "scales")
     tensors = [parameters[name] for name in names]
-    plain = all(each.device.type == "cpu" and each.dtype == torch.float32 for each in tensors)
+    plain = all(tensor.device.type == "cpu" and tensor.dtype == torch.float32 for tensor in tensors)
     return plain and not parameters["anchors"].requires_grad
 
 
@@ -251,4 +251,4 @@ def _fused(
     view = View(parameters["anchors"], seen.rows, seen.factor, heads.inputs(views), rows)
     layers = [heads.first_layers(parameters, code), *heads.second_layers(parameters)]
     tensors = (features, parameters["offsets"], parameters["scales"])
-    return gaussians_of(view, *tensors, *(each for layer in layers for each in layer))
+    return gaussians_of(view, *tensors, *(tensor for layer in layers for tensor in layer))

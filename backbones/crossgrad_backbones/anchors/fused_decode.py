@@ -114,8 +114,8 @@ def forward(inputs: Inputs) -> tuple[tuple[Tensor, ...], Kept]:
     networks.count(array(opacities), starts)
     drawn = int(starts[-1])
     origin, slot = (torch.empty(drawn, dtype=torch.int64) for _ in range(2))
-    widths = ((3,), (4,), (3,), (3,), (), (3,))
-    means, quats, shares, scales, kept, colors = (torch.empty(drawn, *each) for each in widths)
+    shapes = ((3,), (4,), (3,), (3,), (), (3,))
+    means, quats, shares, scales, kept, colors = (torch.empty(drawn, *shape) for shape in shapes)
     read = (opacities, inputs.view.positions, inputs.offsets, spreads, inputs.view.rows)
     written = (origin, slot, means, quats, shares, scales, kept, colors)
     _fill(inputs, hidden, (*map(array, read), starts, *map(array, written)))
@@ -155,7 +155,7 @@ def _fill(inputs: Inputs, hidden: Tensor, arrays: tuple[NDArray[Any], ...]) -> N
     """Run the second layers of covariance and colour, and write the drawn Gaussians."""
     (_, (cov, cov_bias), (color, color_bias)) = inputs.second
     width = cov.shape[1]
-    for part in stretches(len(inputs.view.rows)):
-        covariances = torch.addmm(cov_bias, hidden[part, width : 2 * width], cov.T)
-        colors = torch.addmm(color_bias, hidden[part, 2 * width :], color.T)
-        parallel(networks.gather, part.start, array(covariances), array(colors), *arrays)
+    for stretch in stretches(len(inputs.view.rows)):
+        covariances = torch.addmm(cov_bias, hidden[stretch, width : 2 * width], cov.T)
+        colors = torch.addmm(color_bias, hidden[stretch, 2 * width :], color.T)
+        parallel(networks.gather, stretch.start, array(covariances), array(colors), *arrays)

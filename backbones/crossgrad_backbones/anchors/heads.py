@@ -188,9 +188,14 @@ class Heads:
             features = self.mixed(parameters, features, views)
         inputs = torch.cat([features, self.inputs(views)], 1)
         hidden = linear(inputs, *self.first_layers(parameters, code)).relu_()
-        parts = torch.split(hidden, self.feature, 1)
+        hidden_layers = torch.split(hidden, self.feature, 1)
         layers = self.second_layers(parameters)
-        return Raw(*(linear(part, *layer) for part, layer in zip(parts, layers, strict=True)))
+        return Raw(
+            *(
+                linear(hidden_layer, *layer)
+                for hidden_layer, layer in zip(hidden_layers, layers, strict=True)
+            )
+        )
 
 
 @dataclass(frozen=True)
@@ -253,7 +258,7 @@ def product(left: Tensor, right: Tensor) -> Tensor:
     The sum is computed panel by panel. The libraries split one long sum over all threads, so the
     bits would depend on the number of threads.
     """
-    first, second = (torch.unflatten(each, 0, (-1, PANEL)) for each in (left, right))
+    first, second = (torch.unflatten(matrix, 0, (-1, PANEL)) for matrix in (left, right))
     return torch.bmm(first.transpose(1, 2), second).sum(0)
 
 
@@ -276,5 +281,5 @@ class _Linear(Function):
     def backward(ctx: Any, given: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         inputs, weight = ctx.saved_tensors
         padding = (0, 0, 0, -len(inputs) % PANEL)
-        padded = (functional.pad(each, padding) for each in (given, inputs))
+        padded = (functional.pad(tensor, padding) for tensor in (given, inputs))
         return given @ weight, product(*padded), given.sum(0)

@@ -159,8 +159,8 @@ def code_of(codes: Tensor, poses: Tensor, camera: Camera, *, training: bool) -> 
         training: True if the view is trained on.
     """
     if training:
-        own = camera.world_to_camera[:3].to(poses, non_blocking=True)
-        same = (poses == own).flatten(1).all(1).nonzero()
+        pose = camera.world_to_camera[:3].to(poses, non_blocking=True)
+        same = (poses == pose).flatten(1).all(1).nonzero()
         if len(same):
             return codes[same[0, 0]]
     return codes.mean(0)

@@ -68,8 +68,8 @@ def numbered(cells: Tensor) -> Tensor:
     """
     number = cells.new_zeros(cells.shape[0])
     for column in cells.unbind(1):
-        values, place = torch.unique(column, return_inverse=True)
-        number = torch.unique(number * len(values) + place, return_inverse=True)[1]
+        values, value_index = torch.unique(column, return_inverse=True)
+        number = torch.unique(number * len(values) + value_index, return_inverse=True)[1]
     return number
 
 
@@ -92,5 +92,5 @@ def free_cells(wanted: Tensor, taken: Tensor) -> tuple[Tensor, Tensor]:
     first.scatter_reduce_(0, mine, rows, "amin")
     free = first < len(wanted)
     free[number[len(wanted) :]] = False
-    place = torch.where(free, torch.cumsum(free, 0) - 1, -1)
-    return first[free], place[mine]
+    new_cell = torch.where(free, torch.cumsum(free, 0) - 1, -1)
+    return first[free], new_cell[mine]

@@ -70,9 +70,9 @@ def requests(
     levels = parameters["levels"]
     asks = request.eligible & (request.gradient >= thresholds.at(levels)[:, None])
     anchors, slots = asks.nonzero().unbind(1)
-    strength, own = request.gradient[anchors, slots], levels[anchors]
-    finer = (strength >= thresholds.at(own + 1)) & (own + 1 < lattice.levels)
-    asked = own + finer
+    strength, anchor_levels = request.gradient[anchors, slots], levels[anchors]
+    finer = (strength >= thresholds.at(anchor_levels + 1)) & (anchor_levels + 1 < lattice.levels)
+    asked = anchor_levels + finer
     places = lattice.coordinates(offset_means(parameters, anchors, slots), asked)
     sites = torch.cat([asked[:, None], cells_of(places, 1.0)], 1)
     features = parameters["features"][anchors].masked_fill(finer[:, None], -torch.inf)
@@ -105,10 +105,10 @@ def grown(
     lattice, levels = Lattice.of(parameters["lattice"]), parameters["levels"]
     asked = requests(parameters, lattice, request, thresholds)
     held = cells_of(lattice.coordinates(parameters["anchors"], levels), 1.0)
-    first, place = free_cells(asked.sites, torch.cat([levels[:, None], held], 1))
-    wanted = place >= 0
-    features = largest(asked.features[wanted], place[wanted], len(first))
-    strength = largest(asked.strength[wanted, None], place[wanted], len(first))
+    first, new_cell = free_cells(asked.sites, torch.cat([levels[:, None], held], 1))
+    wanted = new_cell >= 0
+    features = largest(asked.features[wanted], new_cell[wanted], len(first))
+    strength = largest(asked.strength[wanted, None], new_cell[wanted], len(first))
     at = asked.sites[first, 0]
     positions = lattice.positions(asked.sites[first, 1:], at).to(parameters["anchors"])
     new = NewAnchors(

@@ -301,8 +301,8 @@ def geometric_mean(values: Floats) -> float:
     """Return the n-th root of a product, without underflow, overflow or loss of digits."""
     mantissa, exponent = 1.0, 0
     for value in values:
-        part, power = math.frexp(value)
-        mantissa *= part
+        fraction, power = math.frexp(value)
+        mantissa *= fraction
         exponent += power
     n = values.size
     whole = exponent // n

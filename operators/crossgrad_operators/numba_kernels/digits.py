@@ -111,10 +111,10 @@ def copy(values: Pairs, to: Pairs) -> None:
 @strict_device
 def longest_of(norms: Pairs) -> tuple[Pair, float]:
     """Return the largest of non-negative numbers, and the count of numbers above zero."""
-    place, count = 0, 0.0
+    longest, count = 0, 0.0
     for k in range(len(norms)):
-        if norms[k, 0] > norms[place, 0]:
-            place = k
+        if norms[k, 0] > norms[longest, 0]:
+            longest = k
         if norms[k, 0] > 0.0:
             count += 1.0
-    return at(norms, place), count
+    return at(norms, longest), count

@@ -193,9 +193,9 @@ def _first_zero(problem: Polyhedron, count: int) -> tuple[float, int]:
         k = problem.chosen[i]
         y, step = problem.y[k, 0], problem.step[k, 0]
         if y - step <= 0.0:
-            part = y / step if step > 0.0 else 0.0
-            if leaving < 0 or part < share:
-                share, leaving = part, k
+            candidate = y / step if step > 0.0 else 0.0
+            if leaving < 0 or candidate < share:
+                share, leaving = candidate, k
     return share, leaving
 
 

@@ -329,8 +329,8 @@ def _set_out(problem: Polyhedron, norms: Pairs, q: Pairs, c: float) -> Search:
     r = np.empty((views, 2))
     copy(problem.heights, r)
     for k in range(views):
-        part = quotient(at(norms, k), longest, exact)
-        put(problem.base, k, quotient(part, (count, 0.0), exact))
+        relative_norm = quotient(at(norms, k), longest, exact)
+        put(problem.base, k, quotient(relative_norm, (count, 0.0), exact))
     for k in range(views):
         put(q, k, products(problem.cosines[k], problem.base, 0, views, exact))
     mean = square(problem, problem.base)

@@ -151,12 +151,12 @@ def _cases(names: Sequence[str], case: str | None, elements: int, csv: Path | No
     from crossgrad_operators.stress.cases import cases
     from crossgrad_operators.stress.suite import run_suite
 
-    chosen = [each for each in cases(large=elements) if (case or "") in each.name]
+    chosen = [choice for choice in cases(large=elements) if (case or "") in choice.name]
     if not chosen:
         raise UserError(
             "no case name contains this text",
             where=f"--case {case}",
-            expected=f"a part of {', '.join(each.name for each in cases(large=elements))}",
+            expected=f"a part of {', '.join(choice.name for choice in cases(large=elements))}",
             todo="leave --case out to run all cases",
         )
     return _table(list(run_suite(names, chosen, progress=Progress().tell)), csv)
@@ -168,7 +168,7 @@ def _rows(names: Sequence[str], dtypes: Types, rows: str, csv: Path | None) -> b
 
     chosen = [read_rows(rows, dtype) for dtype in dtypes]
     subjects = [subject_of(name) for name in names]
-    return _table([cell for each in chosen for cell in run_rows(subjects, each)], csv)
+    return _table([cell for case in chosen for cell in run_rows(subjects, case)], csv)
 
 
 def _table(cells: "list[Cell]", csv: Path | None) -> bool:
@@ -203,14 +203,14 @@ def _matrices(
     from crossgrad_operators.stress.suite import subject_of
 
     seed, matrices = extent
-    found, progress = [], Progress()
+    results, progress = [], Progress()
     for subject in [subject_of(name) for name in names]:
         progress.tell(subject.name)
-        found.append(run_finite(subject, matrices, seed, dtypes))
-    typer.echo(as_text(found))
+        results.append(run_finite(subject, matrices, seed, dtypes))
+    typer.echo(as_text(results))
     if csv is not None:
-        write_csv(found, csv)
-    return not any(each.not_finite for each in found)
+        write_csv(results, csv)
+    return not any(result.not_finite for result in results)
 
 
 class _Clock:

@@ -176,7 +176,7 @@ def _settle(
         share = min(falling.values(), default=1)
         for i in active:
             x[i] += share * (target[i] - x[i])
-        for i in [i for i, part in falling.items() if part == share]:
+        for i in [i for i, step_share in falling.items() if step_share == share]:
             x[i] *= 0
             active.remove(i)
         if not falling:
@@ -187,13 +187,13 @@ def _settle(
 def pivots(matrix: Matrix) -> Vector:
     """Return the Cholesky pivots of a positive semi-definite matrix, the largest first."""
     left = [list(row) for row in matrix]
-    found = []
+    positive_pivots = []
     while left:
         k = max(range(len(left)), key=lambda i: left[i][i])
         pivot, column = left[k][k], left[k]
         if pivot <= 0:
             break
-        found.append(pivot)
+        positive_pivots.append(pivot)
         kept = [i for i in range(len(left)) if i != k]
         left = [[left[i][j] - column[i] * column[j] / pivot for j in kept] for i in kept]
-    return found
+    return positive_pivots

@@ -127,9 +127,9 @@ def partners_of(question: Question, *, shuffled: bool) -> list[list[int]]:
     order = np.tile(np.arange(question.views), (question.views, 1))
     if shuffled and question.views > 2:  # noqa: PLR2004
         order = question.rng.permuted(order, axis=1)
-    place = {view: i for i, view in enumerate(question.places)}
+    position_of = {view: i for i, view in enumerate(question.places)}
     return [
-        [place[j] for j in order[view].tolist() if j in place and j != view]
+        [position_of[j] for j in order[view].tolist() if j in position_of and j != view]
         for view in question.places
     ]
 

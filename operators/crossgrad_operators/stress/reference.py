@@ -81,9 +81,9 @@ def answer(
     """Return the oracle's answer for the views that have a gradient."""
     mp = require_mpmath().mp
     places = [k for k in range(len(gramian)) if gramian[k][k] > 0]
-    part = [[gramian[i][j] for j in places] for i in places]
+    reduced_gramian = [[gramian[i][j] for j in places] for i in places]
     question = Question(
-        gramian=part,
+        gramian=reduced_gramian,
         places=places,
         views=len(gramian),
         options=options,

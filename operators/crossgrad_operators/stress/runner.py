@@ -99,12 +99,12 @@ def judged(
     for step in range(STEPS):
         views = views_of(exact.case.views, step)
         try:
-            found, state, seconds = timed(operator, exact.case, views, state)
+            result, state, seconds = timed(operator, exact.case, views, state)
         except Exception as error:
             # Third-party code may raise anything.
             return Finding("failed", reason=f"{type(error).__name__}: {error}"), []
         times.append(seconds)
-        finding = compared(exact, found, reference, views, memory)
+        finding = compared(exact, result, reference, views, memory)
         if finding.reason == UNPROVEN:
             return finding, []
         findings.append(finding)

@@ -48,10 +48,10 @@ def _result(operator: Operator, case: Case, views: Views | None = None) -> Tenso
     return gradient.double()
 
 
-def _error(found: Tensor, expected: Tensor, case: Case) -> float:
+def _error(result: Tensor, expected: Tensor, case: Case) -> float:
     longest = float(np.linalg.norm(case.exact_head, axis=1).max())
     scale = max(longest, float(expected.norm()))
-    return float((found - expected).norm()) / (_UNIT * scale)
+    return float((result - expected).norm()) / (_UNIT * scale)
 
 
 def _counts(operator: Operator) -> Iterator[int]:
@@ -66,8 +66,8 @@ def homogeneity(operator: Operator) -> float | None:
         for c in (2.0**-80, 3.0, 2.0**80):
             scaled = replace(case, head=case.exact_head * c)
             rounded = replace(case, head=scaled.exact_head / c)
-            found = _result(operator, scaled) / c
-            worst = max(worst, _error(found, _result(operator, rounded), case))
+            result = _result(operator, scaled) / c
+            worst = max(worst, _error(result, _result(operator, rounded), case))
     return worst
 
 
@@ -78,8 +78,8 @@ def permutation(operator: Operator) -> float | None:
     case, views = _rows(2), sample_views(2)
     turned = replace(case, head=case.head[::-1].copy())
     turned_views = Views(views.labels[::-1], views.ratios[::-1], views.seed)
-    found = _result(operator, turned, turned_views)
-    return _error(found, _result(operator, case, views), case)
+    result = _result(operator, turned, turned_views)
+    return _error(result, _result(operator, case, views), case)
 
 
 def one_view(operator: Operator) -> float | None:
@@ -87,8 +87,8 @@ def one_view(operator: Operator) -> float | None:
     if not operator.views.admits(1):
         return None
     case = _rows(1)
-    found = _result(operator, case, Views(("near",), (1.0,), 0))
-    return _error(found, torch.from_numpy(case.exact_head[0]), case)
+    result = _result(operator, case, Views(("near",), (1.0,), 0))
+    return _error(result, torch.from_numpy(case.exact_head[0]), case)
 
 
 def size(operator: Operator) -> float | None:
@@ -101,8 +101,8 @@ def size(operator: Operator) -> float | None:
         copies = 3001
         tiled = replace(case, head=np.zeros((views, 0)), pattern=case.head, copies=copies)
         expected = _result(operator, case)
-        found = _result(operator, tiled).view(copies, -1)
-        worst = max(worst, *(_error(row, expected, case) for row in (found[0], found[-1])))
+        result = _result(operator, tiled).view(copies, -1)
+        worst = max(worst, *(_error(row, expected, case) for row in (result[0], result[-1])))
     return worst
 
 
@@ -115,8 +115,8 @@ def block_independence(operator: Operator) -> float | None:
         other = Block("scales", ("scales",), False, "geometry", LearningRate(1.0))
         gradients = [{"means": g, "scales": _reversed(g)} for g in case.gradients()]
         context = context_of(gradients, (other, BLOCK), circumstances)
-        found = operator.aggregate(context, EMPTY_STATE)[0].gradients["means"]
-        if found is None or not torch.equal(found.double(), _result(operator, case)):
+        result = operator.aggregate(context, EMPTY_STATE)[0].gradients["means"]
+        if result is None or not torch.equal(result.double(), _result(operator, case)):
             return float("inf")
     return 0.0
 
@@ -218,11 +218,11 @@ def run_suite(
         for case in cases:
             progress(case.name)
             exact = ExactCase(case)
-            for each in subjects:
-                yield run_case(each.name, each.operator, exact, each.reference)
+            for subject in subjects:
+                yield run_case(subject.name, subject.operator, exact, subject.reference)
         for law in LAWS:
             progress(law.__name__)
-            yield from (run_law(each.name, each.operator, law) for each in subjects)
+            yield from (run_law(subject.name, subject.operator, law) for subject in subjects)
 
 
 def reference_of(name: str, operator: Operator) -> Reference:

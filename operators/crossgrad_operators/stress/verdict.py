@@ -117,10 +117,10 @@ def facts_of(exact: ExactCase, answer: Answer | None = None) -> Facts:
     """Return the facts that define the sets. Without an answer, weights and length are zero."""
     gramian = exact.gramian
     places = [k for k in range(exact.case.views) if gramian[k][k] > 0]
-    part = [[gramian[i][j] for j in places] for i in places]
+    reduced_gramian = [[gramian[i][j] for j in places] for i in places]
     return Facts(
-        norms=np.array([float(n) for n in lengths(part)]),
-        cosines=cosines(part),
+        norms=np.array([float(n) for n in lengths(reduced_gramian)]),
+        cosines=cosines(reduced_gramian),
         weights=np.array([float(answer.weights[k]) if answer else 0.0 for k in places]),
         length=float(answer.length) if answer else 0.0,
         unit=_unit(exact.case),

@@ -115,7 +115,7 @@ def quantile(values: Tensor, share: float) -> Tensor:
     `torch.quantile` accepts at most 2^24 values.
     """
     ordered = values.sort().values
-    place = share * (len(ordered) - 1)
-    below = int(place)
+    position = share * (len(ordered) - 1)
+    below = int(position)
     above = min(below + 1, len(ordered) - 1)
-    return torch.lerp(ordered[below], ordered[above], place - below)
+    return torch.lerp(ordered[below], ordered[above], position - below)

@@ -92,8 +92,8 @@ class Plan:
         clones = growth.clone.nonzero().squeeze(1)
         parents = growth.split.nonzero().squeeze(1)
         source = torch.cat([stay, clones, parents, parents])
-        place = torch.arange(source.shape[0], device=source.device)
-        return cls(source, place >= len(stay), place >= len(stay) + len(clones))
+        row_numbers = torch.arange(source.shape[0], device=source.device)
+        return cls(source, row_numbers >= len(stay), row_numbers >= len(stay) + len(clones))
 
 
 class CloneSplit(Densifier):
@@ -235,12 +235,12 @@ def _planned(context: DensifyContext, plan: Plan, values: Mapping[str, Rows], na
 
 def _compacted(values: Mapping[str, Rows], keep: Tensor) -> dict[str, Rows]:
     """Return the values of the rows that are kept [M], with their new row numbers."""
-    place = torch.cumsum(keep, 0) - 1
+    new_rows = torch.cumsum(keep, 0) - 1
     compacted = {}
-    for name, each in values.items():
-        rows = torch.arange(len(keep), device=keep.device) if each.rows is None else each.rows
+    for name, old in values.items():
+        rows = torch.arange(len(keep), device=keep.device) if old.rows is None else old.rows
         kept = keep[rows]
-        compacted[name] = replace(each, values=each.values[kept], rows=place[rows[kept]])
+        compacted[name] = replace(old, values=old.values[kept], rows=new_rows[rows[kept]])
     return compacted
 
 
@@ -293,8 +293,8 @@ class AxisSplit(CloneSplit):
         # The first children of all parents come before the second ones.
         parents = plan.source[rows[: len(rows) // 2]]
         left, right = (
-            child_on_axis(context, parents, place, log(_KEPT), log(_FAINTER))
-            for place in (-_APART, _APART)
+            child_on_axis(context, parents, offset, log(_KEPT), log(_FAINTER))
+            for offset in (-_APART, _APART)
         )
         return {name: Rows(torch.cat([left[name], right[name]]), rows) for name in left}
 
@@ -321,11 +321,11 @@ def child_on_axis(
     edited = ("means", "scales", "quats", "opacities")
     old = {name: context.parameters[name].detach()[parents] for name in edited}
     longest = old["scales"].argmax(dim=1)
-    each = torch.arange(len(parents), device=parents.device)
-    axis = rotation_matrices(old["quats"])[each, :, longest]
-    width = torch.exp(old["scales"][each, longest])
+    every_parent = torch.arange(len(parents), device=parents.device)
+    axis = rotation_matrices(old["quats"])[every_parent, :, longest]
+    width = torch.exp(old["scales"][every_parent, longest])
     scales = old["scales"].clone()
-    scales[each, longest] += length
+    scales[every_parent, longest] += length
     logarithm = logsigmoid(old["opacities"]) + opacity
     return {
         "means": old["means"] + axis * (place * width)[:, None],

@@ -29,8 +29,8 @@ def inconsistency(sums: Tensor) -> Tensor:
     x, y, absolute_x, absolute_y, number = sums
     # Without pixels this is (1 - 0 / 1) times a ga of 0. Rounding can make the mean longer than 1.
     rest = (1.0 - torch.sqrt(x * x + y * y) / number.clamp(min=1.0)).clamp(min=0.0)
-    found: Tensor = rest * torch.sqrt(absolute_x * absolute_x + absolute_y * absolute_y)
-    return found
+    scores: Tensor = rest * torch.sqrt(absolute_x * absolute_x + absolute_y * absolute_y)
+    return scores
 
 
 def plane_scores(bins: Tensor) -> Tensor:
@@ -157,5 +157,5 @@ def _child(
     parent's centre.
     """
     share = 1.0 - position if right else position
-    place = 3.0 * (1.0 - share) * (1.0 if right else -1.0)
-    return child_on_axis(context, parents, place, torch.log(share), torch.log(share))
+    offset = 3.0 * (1.0 - share) * (1.0 if right else -1.0)
+    return child_on_axis(context, parents, offset, torch.log(share), torch.log(share))

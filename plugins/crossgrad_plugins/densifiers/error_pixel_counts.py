@@ -162,7 +162,7 @@ class CountsMarkedPixels(Densifier, ABC):
         name = next(block.tensors[0] for block in blocks if block.per_primitive)
         like = context.parameters[name].detach()
         zeros = like.new_zeros(like.shape[0], len(self._regimes(context)))
-        return {each: have.get(each, zeros).clone() for each in (MARKED, ERROR, VISITS)}
+        return {key: have.get(key, zeros).clone() for key in (MARKED, ERROR, VISITS)}
 
     def _regimes(self, context: DensifyContext) -> list[str]:
         """Return the regimes that are counted separately."""

@@ -124,10 +124,10 @@ def shared_scale(opacity: Tensor, copies: Tensor) -> Tensor:
     nodes = _STEP * torch.arange(_STEPS + 1, dtype=opacity.dtype, device=opacity.device)
     weights = torch.full_like(nodes, 2.0 * _STEP / sqrt(2.0 * pi))
     weights[0] /= 2.0
-    each = shared_opacity(opacity, copies)[:, None] * torch.exp(-nodes * nodes / 2.0)
-    covered = -torch.expm1(copies[:, None] * torch.log1p(-each))
-    some = opacity > torch.finfo(opacity.dtype).tiny
-    return torch.where(some, opacity / (covered @ weights), torch.ones_like(opacity))
+    alphas = shared_opacity(opacity, copies)[:, None] * torch.exp(-nodes * nodes / 2.0)
+    covered = -torch.expm1(copies[:, None] * torch.log1p(-alphas))
+    is_normal = opacity > torch.finfo(opacity.dtype).tiny
+    return torch.where(is_normal, opacity / (covered @ weights), torch.ones_like(opacity))
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ def densifier_of(value: object) -> Densifier:
             raise ValueError("must be a densifier's name, or a name with options")
         options = {key: option for key, option in choice.items() if key != "name"}
         value = build_component(Densifier, str(choice["name"]), options)
-    further = {each for each in dir(value) if each.startswith("crossgrad_")} - _ANSWERED
+    further = {hook for hook in dir(value) if hook.startswith("crossgrad_")} - _ANSWERED
     if further or not value.edits or isinstance(value, CountsMarkedPixels):
         raise ValueError(
             f"{component_name(value)} cannot be used inside another densifier: it has "
@@ -102,17 +102,17 @@ class MultiViewGate(CountsMarkedPixels):
 
     @override
     def densify(self, context: DensifyContext, state: PluginState) -> tuple[Edit, PluginState]:
-        own, inner = _parted(state)
-        own = self.counted(context, own) if context.schedule.collects(context.step) else own
+        gate, inner = _parted(state)
+        gate = self.counted(context, gate) if context.schedule.collects(context.step) else gate
         may_grow = None
         if context.schedule.densifies(context.step):
-            seen = self.importance_of(own)
+            seen = self.importance_of(gate)
             may_grow = seen.above(self.importance).any(dim=1)
-            own = PluginState()
+            gate = PluginState()
         edit, inner = self.of.densify(replace(context, may_grow=may_grow), inner)
         if may_grow is not None:
             self._check(edit, may_grow)
-        return edit, _joined(own, inner)
+        return edit, _joined(gate, inner)
 
     def _check(self, edit: Edit, may_grow: Tensor) -> None:
         """Raise an error if a primitive grew that may not grow."""
@@ -131,21 +131,21 @@ class MultiViewGate(CountsMarkedPixels):
 
 def _parted(state: PluginState) -> tuple[PluginState, PluginState]:
     """Return the gate's part of a state and the other densifier's part."""
-    own, inner = (
+    gate, inner = (
         {
-            part: {
+            field: {
                 name.removeprefix(OWN): value
-                for name, value in getattr(state, part).items()
+                for name, value in getattr(state, field).items()
                 if name.startswith(OWN) == mine
             }
-            for part in ("values", "tensors", "per_primitive")
+            for field in ("values", "tensors", "per_primitive")
         }
         for mine in (True, False)
     )
-    return PluginState(**own), PluginState(**inner)
+    return PluginState(**gate), PluginState(**inner)
 
 
-def _joined(own: PluginState, inner: PluginState) -> PluginState:
+def _joined(gate: PluginState, inner: PluginState) -> PluginState:
     """Return one state that contains both parts."""
-    per_primitive = {OWN + name: rows for name, rows in own.per_primitive.items()}
+    per_primitive = {OWN + name: rows for name, rows in gate.per_primitive.items()}
     return replace(inner, per_primitive={**inner.per_primitive, **per_primitive})

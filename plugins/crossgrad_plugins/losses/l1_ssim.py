@@ -112,14 +112,14 @@ def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:
         shapes = f"{list(target.shape)} and {list(image.shape)}"
         raise ValueError(f"`target` must have the shape of `image`; found {shapes}")
     if mask is not None and (mask.shape != image.shape[:2] or mask.dtype != torch.bool):
-        found = f"{list(mask.shape)} {mask.dtype}"
-        raise ValueError(f"`mask` must be [H, W] bool; found {found} for {list(image.shape)}")
+        description = f"{list(mask.shape)} {mask.dtype}"
+        raise ValueError(f"`mask` must be [H, W] bool; found {description} for {list(image.shape)}")
 
 
 def _check_weights(image: Tensor, weights: Tensor) -> None:
     if weights.shape != image.shape[:2] or not weights.is_floating_point():
-        found = f"{list(weights.shape)} {weights.dtype}"
-        message = f"`weights` must be [H, W] floats; found {found} for {list(image.shape)}"
+        description = f"{list(weights.shape)} {weights.dtype}"
+        message = f"`weights` must be [H, W] floats; found {description} for {list(image.shape)}"
         raise ValueError(message)
 
 

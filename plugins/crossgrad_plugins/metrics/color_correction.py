@@ -100,9 +100,9 @@ def _sums(render: Bytes, photo: Bytes) -> Floats:
     """
     total = np.zeros((7, 7))
     for at in range(0, len(render), _AT_ONCE):
-        part = slice(at, at + _AT_ONCE)
-        values = np.ones((len(render[part]), 7))
-        values[:, :3], values[:, 3:6] = render[part], photo[part]
+        rows = slice(at, at + _AT_ONCE)
+        values = np.ones((len(render[rows]), 7))
+        values[:, :3], values[:, 3:6] = render[rows], photo[rows]
         total += values.T @ values
     return total
 

@@ -73,8 +73,8 @@ class Perceptual(Metric):
         if self.trunk is not None:
             self._weights(self.trunk)
         elif self.heads is not None:
-            place = f"metrics.{self.entry}"
-            return [f"{place}.heads has no effect without a network: --set {place}.trunk=FILE"]
+            setting = f"metrics.{self.entry}"
+            return [f"{setting}.heads has no effect without a network: --set {setting}.trunk=FILE"]
         return []
 
     @override

@@ -94,38 +94,38 @@ def read_weights(net: Trunk, trunk: Path, heads: Path | None, setting: str) -> W
 
 def _read_trunk(net: Trunk, path: Path, setting: str) -> tuple[tuple[Tensor, Tensor], ...]:
     todo = f"--set {setting}=FILE must name torchvision's {net.model}, such as {net.published}"
-    found = {name.removeprefix("features."): tensor for name, tensor in _read(path, todo).items()}
+    tensors = {name.removeprefix("features."): tensor for name, tensor in _read(path, todo).items()}
     pairs = []
     for layer in net.layers:
-        weight, bias = (_name(layer, part) for part in ("weight", "bias"))
-        _check(path, found, {weight: layer.shape, bias: layer.shape[:1]}, todo)
-        pairs.append((found[weight].float(), found[bias].float()))
+        weight, bias = (_name(layer, parameter) for parameter in ("weight", "bias"))
+        _check(path, tensors, {weight: layer.shape, bias: layer.shape[:1]}, todo)
+        pairs.append((tensors[weight].float(), tensors[bias].float()))
     return tuple(pairs)
 
 
-def _name(layer: Convolution, part: str) -> str:
-    return f"{layer.layer}.{part}"
+def _name(layer: Convolution, parameter: str) -> str:
+    return f"{layer.layer}.{parameter}"
 
 
 def _read_heads(net: Trunk, path: Path, setting: str) -> tuple[Tensor, ...]:
     todo = (
         f"--set {setting}=FILE must name the linear heads of LPIPS 0.1 for {net.name}, {net.heads}"
     )
-    found = _read(path, todo)
+    tensors = _read(path, todo)
     shapes: dict[str, tuple[int, ...]] = {
-        f"lin{place}.model.1.weight": (1, layer.shape[0], 1, 1)
-        for place, layer in enumerate(net.compared)
+        f"lin{number}.model.1.weight": (1, layer.shape[0], 1, 1)
+        for number, layer in enumerate(net.compared)
     }
-    _check(path, found, shapes, todo)
-    return tuple(found[name].float() for name in shapes)
+    _check(path, tensors, shapes, todo)
+    return tuple(tensors[name].float() for name in shapes)
 
 
 def _installed(net: Trunk, setting: str) -> tuple[Path, str]:
     """Return the heads in an installed package, and its name, without importing it."""
     for package, folders in _PACKAGES:
         spec = find_spec(package)
-        for place in (spec.submodule_search_locations or ()) if spec is not None else ():
-            file = Path(place, *folders, net.heads)
+        for location in (spec.submodule_search_locations or ()) if spec is not None else ():
+            file = Path(location, *folders, net.heads)
             if file.is_file():
                 return file, package
     raise UserError(
@@ -147,14 +147,14 @@ def _read(path: Path, todo: str) -> Mapping[str, Tensor]:
 
             return load_file(path)
         # Map to the CPU, so that files written on a GPU can be read without a GPU.
-        found = torch.load(path, map_location="cpu", weights_only=True)
+        content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # Exceptions for damaged files are not documented.
         # Torch's own message ends with the advice to execute code from the file, so it is not
         # shown.
         raise _unreadable(path, f"{type(error).__name__} while reading", todo) from error
-    if not isinstance(found, Mapping):
-        raise _unreadable(path, f"an object of type {type(found).__name__}", todo)
-    return {name: tensor for name, tensor in found.items() if isinstance(tensor, Tensor)}
+    if not isinstance(content, Mapping):
+        raise _unreadable(path, f"an object of type {type(content).__name__}", todo)
+    return {name: tensor for name, tensor in content.items() if isinstance(tensor, Tensor)}
 
 
 def _unreadable(path: Path, found: str, todo: str) -> UserError:
@@ -168,22 +168,24 @@ def _unreadable(path: Path, found: str, todo: str) -> UserError:
 
 
 def _check(
-    path: Path, found: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]], todo: str
+    path: Path, tensors: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]], todo: str
 ) -> None:
     """Raise an error for weights of another network or for non-finite values."""
     for name, shape in shapes.items():
-        tensor = found.get(name)
+        tensor = tensors.get(name)
         if tensor is None or tuple(tensor.shape) != shape:
-            told = "no tensor with that name" if tensor is None else f"shape {list(tensor.shape)}"
+            problem = (
+                "no tensor with that name" if tensor is None else f"shape {list(tensor.shape)}"
+            )
         elif not bool(torch.isfinite(tensor).all()):
-            told = "numbers that are not finite"
+            problem = "numbers that are not finite"
         else:
             continue
         raise UserError(
             "the file contains the weights of another network",
             where=f"{path}: {name}",
             expected=f"shape {list(shape)}",
-            found=told,
+            found=problem,
             todo=todo,
         )
 

@@ -73,15 +73,15 @@ def _vgg(stages: tuple[tuple[int, int], ...]) -> tuple[Convolution, ...]:
     layers: list[Convolution] = []
     number, channels_in = 0, 3
     widths = [(stage, width) for stage, (count, width) in enumerate(stages) for _ in range(count)]
-    for stage, group in groupby(widths, key=lambda each: each[0]):
+    for stage, group in groupby(widths, key=lambda pair: pair[0]):
         members = list(group)
-        for place, (_, width) in enumerate(members):
+        for position, (_, width) in enumerate(members):
             layers.append(
                 Convolution(
                     layer=number,
                     shape=(width, channels_in, 3, 3),
-                    pools=stage > 0 and place == 0,
-                    compared=place == len(members) - 1,
+                    pools=stage > 0 and position == 0,
+                    compared=position == len(members) - 1,
                 )
             )
             number, channels_in = number + 2, width

@@ -75,5 +75,7 @@ def _distances(lights: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDAr
 
     Values beyond white are clipped to white, as in the comparison of the render with the photo.
     """
-    some, others = (encoded(torch.from_numpy(each)).clamp(max=1.0) for each in (lights, wanted))
-    return (some - others).square().mean(dim=1).numpy()
+    srgb_lights, srgb_wanted = (
+        encoded(torch.from_numpy(brightness)).clamp(max=1.0) for brightness in (lights, wanted)
+    )
+    return (srgb_lights - srgb_wanted).square().mean(dim=1).numpy()

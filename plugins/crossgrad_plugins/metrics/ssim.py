@@ -98,9 +98,9 @@ def _skimage_map(image: Tensor, target: Tensor, mask: Tensor | None) -> NDArray[
     from skimage.metrics import structural_similarity
 
     mask = None if mask is None else mask.cpu()
-    rendered, photo = (masked(to_uint8(each), mask).numpy() for each in (image, target))
+    rendered, photo = (masked(to_uint8(picture), mask).numpy() for picture in (image, target))
     height = len(rendered)
-    found = np.empty(rendered.shape)
+    ssim_map = np.empty(rendered.shape)
 
     def work(start: int) -> None:
         stop = min(start + _ROWS, height)
@@ -117,11 +117,11 @@ def _skimage_map(image: Tensor, target: Tensor, mask: Tensor | None) -> NDArray[
             channel_axis=-1,
             full=True,
         )
-        found[start:stop] = full[start - first : stop - first]
+        ssim_map[start:stop] = full[start - first : stop - first]
 
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         list(pool.map(work, range(0, height, _ROWS)))
-    return found
+    return ssim_map
 
 
 def _keeps_nothing(image: Tensor, mask: Tensor | None) -> bool:

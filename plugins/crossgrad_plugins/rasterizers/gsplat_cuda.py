@@ -92,8 +92,8 @@ class GsplatRasterizer(Rasterizer):
             alike[*size, gaussians.dilation, gaussians.response].append(slot)
         renders: dict[int, Render] = {}
         for slots in alike.values():
-            some, behind = [views[s] for s in slots], [backgrounds[s] for s in slots]
-            renders.update(zip(slots, self._drawn(some, behind, outputs), strict=True))
+            group, behind = [views[s] for s in slots], [backgrounds[s] for s in slots]
+            renders.update(zip(slots, self._drawn(group, behind, outputs), strict=True))
         return [renders[slot] for slot in range(len(views))]
 
     def _drawn(
@@ -106,17 +106,24 @@ class GsplatRasterizer(Rasterizer):
         gaussians, camera = views[0]
         if not len(gaussians):
             return [
-                empty_render(each, own, behind, outputs)
-                for (each, own), behind in zip(views, backgrounds, strict=True)
+                empty_render(view_gaussians, view_camera, behind, outputs)
+                for (view_gaussians, view_camera), behind in zip(views, backgrounds, strict=True)
             ]
         bring_ninja()
         screens = [
-            Screen(torch.zeros(len(each), dtype=torch.int32, device=each.means.device))
-            for each, _ in views
+            Screen(
+                torch.zeros(
+                    len(view_gaussians), dtype=torch.int32, device=view_gaussians.means.device
+                )
+            )
+            for view_gaussians, _ in views
         ]
         # The Gaussians of each view are a separate batch, so that gradients stay separate.
-        tensors = [_batch([getattr(each, name) for each, _ in views]) for name in _GEOMETRY]
-        tensors.append(_batch([_colors(each, c) for each, c in views]))
+        tensors = [
+            _batch([getattr(view_gaussians, name) for view_gaussians, _ in views])
+            for name in _GEOMETRY
+        ]
+        tensors.append(_batch([_colors(view_gaussians, c) for view_gaussians, c in views]))
         settings = {
             "width": camera.width,
             "height": camera.height,
@@ -155,8 +162,10 @@ def _colors(gaussians: Gaussians, camera: Camera) -> Tensor:
         return view_colors(gaussians, center)
     from gsplat import spherical_harmonics
 
-    found: Tensor = spherical_harmonics(gaussians.sh_degree, gaussians.means - center, coefficients)
-    return (0.5 + found).clamp(min=0.0)
+    harmonics: Tensor = spherical_harmonics(
+        gaussians.sh_degree, gaussians.means - center, coefficients
+    )
+    return (0.5 + harmonics).clamp(min=0.0)
 
 
 def _cameras(cameras: Sequence[Camera], like: Tensor) -> dict[str, Tensor]:

@@ -183,4 +183,4 @@ def _draw(screen: Screen, settings: dict[str, Any], tensors: Sequence[Tensor]) -
 def _observe(screen: Screen, half: tuple[float, float], _centers: Tensor, gradient: Tensor) -> None:
     """Store the gradient [N, 3] by the projected means, converted from NDC units to pixels."""
     along = zip(gradient[:, :2].unbind(1), half, strict=True)
-    screen.mean_gradient = torch.stack([each / side for each, side in along], dim=1)
+    screen.mean_gradient = torch.stack([component / side for component, side in along], dim=1)

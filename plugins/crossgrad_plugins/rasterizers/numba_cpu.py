@@ -187,7 +187,7 @@ class _Draw(torch.autograd.Function):
         if frame is None:
             raise RuntimeError("the backward pass was called before the forward pass")
         v = np.zeros_like(frame.image) if v_image is None else _array(v_image)
-        found = backward(
+        gradients = backward(
             frame,
             v,
             _optional(v_alpha),
@@ -196,14 +196,22 @@ class _Draw(torch.autograd.Function):
             directions=call.directions,
             harmonics=ctx.needs_input_grad[1 + _INPUTS.index("sh_rest")],
         )
-        call.screen.mean_gradient = torch.from_numpy(found.centres)
-        if found.absolute is not None:
-            call.screen.abs_gradient = torch.from_numpy(found.absolute)
-        if found.directions is not None:
-            call.screen.directions = torch.from_numpy(found.directions)
-        colors = found.colors if frame.gaussians.colors is not None else None
-        rest = found.rest if found.rest is not None and found.rest.shape[1] else None
-        arrays = (found.means, found.quats, found.scales, found.opacities, colors, found.dc, rest)
+        call.screen.mean_gradient = torch.from_numpy(gradients.centres)
+        if gradients.absolute is not None:
+            call.screen.abs_gradient = torch.from_numpy(gradients.absolute)
+        if gradients.directions is not None:
+            call.screen.directions = torch.from_numpy(gradients.directions)
+        colors = gradients.colors if frame.gaussians.colors is not None else None
+        rest = gradients.rest if gradients.rest is not None and gradients.rest.shape[1] else None
+        arrays = (
+            gradients.means,
+            gradients.quats,
+            gradients.scales,
+            gradients.opacities,
+            colors,
+            gradients.dc,
+            rest,
+        )
         named = zip(_INPUTS, arrays, strict=True)
         rows = call.screen.rows
         return None, *(_gradient(frame.gaussians, rows, name, array) for name, array in named)

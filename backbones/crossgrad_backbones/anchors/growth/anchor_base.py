@@ -62,10 +62,10 @@ def _add(record: ViewRecord, totals: Mapping[str, Tensor]) -> None:
     views += 1.0 if gaussians.decoded is None else gaussians.decoded
     totals[OPACITY].index_add_(0, origin, gaussians.opacities.clamp(min=0.0))
     seen = screen_statistics.visible(record)
-    place = origin * totals[RENDERS].shape[1] + slot
+    flat_index = origin * totals[RENDERS].shape[1] + slot
     norms = torch.linalg.vector_norm(screen_statistics.ndc_gradient(record), dim=1)
-    totals[GRADIENT].view(-1).index_add_(0, place, norms * seen)
-    totals[RENDERS].view(-1).index_add_(0, place, seen)
+    totals[GRADIENT].view(-1).index_add_(0, flat_index, norms * seen)
+    totals[RENDERS].view(-1).index_add_(0, flat_index, seen)
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,10 @@ class NewAnchors:
             torch.cat([self.features, more.features]),
             torch.cat([self.parents, more.parents]),
             torch.cat([self.strength, more.strength]),
-            {name: torch.cat([own, more.further[name]]) for name, own in self.further.items()},
+            {
+                name: torch.cat([tensor, more.further[name]])
+                for name, tensor in self.further.items()
+            },
         )
 
     def at(self, rows: Tensor) -> "NewAnchors":
@@ -137,7 +140,7 @@ class NewAnchors:
             self.features[rows],
             self.parents[rows],
             self.strength[rows],
-            {name: own[rows] for name, own in self.further.items()},
+            {name: tensor[rows] for name, tensor in self.further.items()},
         )
 
 

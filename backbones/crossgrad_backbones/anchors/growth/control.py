@@ -81,14 +81,14 @@ def _at_level(
     cells = cells_of(offset_means(parameters, anchor, slot), level.cell)
     reached = in_reach(cells)
     anchor, slot, cells = anchor[reached], slot[reached], cells[reached]
-    first, place = free_cells(cells, cells_of(present, level.cell))
-    wanted = place >= 0
+    first, new_cell = free_cells(cells, cells_of(present, level.cell))
+    wanted = new_cell >= 0
     return NewAnchors(
         positions=(cells[first].double() * level.cell).to(present),
         cells=torch.full((len(first),), level.cell, dtype=torch.float64, device=present.device),
-        features=largest(parameters["features"][anchor][wanted], place[wanted], len(first)),
+        features=largest(parameters["features"][anchor][wanted], new_cell[wanted], len(first)),
         parents=anchor[first],
-        strength=largest(gradient[anchor, slot][wanted, None], place[wanted], len(first))[:, 0],
+        strength=largest(gradient[anchor, slot][wanted, None], new_cell[wanted], len(first))[:, 0],
     )
 
 

@@ -39,10 +39,10 @@ def in_frustum(
         inside: [P] output.
     """
     count = len(positions)
-    parts = (count + SHARE - 1) // SHARE
-    part = next_job(jobs, parts)
-    while part < parts:
-        for p in range(part * SHARE, min(count, (part + 1) * SHARE)):
+    chunks = (count + SHARE - 1) // SHARE
+    chunk = next_job(jobs, chunks)
+    while chunk < chunks:
+        for p in range(chunk * SHARE, min(count, (chunk + 1) * SHARE)):
             x, y, z = positions[p, 0], positions[p, 1], positions[p, 2]
             depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
             passes = depth > near
@@ -52,9 +52,9 @@ def in_frustum(
                 focal, center = axes[k, 0], axes[k, 1]
                 along = pose[k, 0] * x + pose[k, 1] * y + pose[k, 2] * z + pose[k, 3]
                 slope = along / depth
-                place = focal * slope + center
+                projected = focal * slope + center
                 # A centre inside the image needs no further test.
-                if axes[k, 4] <= place <= axes[k, 5]:
+                if axes[k, 4] <= projected <= axes[k, 5]:
                     continue
                 clamped = min(max(slope, axes[k, 2]), axes[k, 3])
                 variance = np.float32(0)
@@ -63,6 +63,6 @@ def in_frustum(
                     variance += row * row
                 ratio = focal / depth
                 extent = reach * math.sqrt(variance * ratio * ratio + dilation)
-                passes = place + extent >= axes[k, 4] and place - extent <= axes[k, 5]
+                passes = projected + extent >= axes[k, 4] and projected - extent <= axes[k, 5]
             inside[p] = passes
-        part = next_job(jobs, parts)
+        chunk = next_job(jobs, chunks)

@@ -25,16 +25,16 @@ SHARE = 256
 def join(jobs: Jobs, features: _Floats, rows: _Ints, views: _Floats, out: _Floats) -> None:
     """Write [A, F + V]: rows [A] of the features [Q, F], then the views [A, V]."""
     anchors, feature, view = len(rows), features.shape[1], views.shape[1]
-    parts = (anchors + SHARE - 1) // SHARE
-    part = next_job(jobs, parts)
-    while part < parts:
-        for a in range(part * SHARE, min(anchors, (part + 1) * SHARE)):
+    chunks = (anchors + SHARE - 1) // SHARE
+    chunk = next_job(jobs, chunks)
+    while chunk < chunks:
+        for a in range(chunk * SHARE, min(anchors, (chunk + 1) * SHARE)):
             row = rows[a]
             for c in range(feature):
                 out[a, c] = features[row, c]
             for c in range(view):
                 out[a, feature + c] = views[a, c]
-        part = next_job(jobs, parts)
+        chunk = next_job(jobs, chunks)
 
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
@@ -55,15 +55,15 @@ def rectify_back(
         gradient: [n or more, H or 3 H].
     """
     width = gradient.shape[1]
-    parts = (anchors + SHARE - 1) // SHARE
-    part = next_job(jobs, parts)
-    while part < parts:
-        for n in range(part * SHARE, min(anchors, (part + 1) * SHARE)):
+    chunks = (anchors + SHARE - 1) // SHARE
+    chunk = next_job(jobs, chunks)
+    while chunk < chunks:
+        for n in range(chunk * SHARE, min(anchors, (chunk + 1) * SHARE)):
             mine = gradient[n]
             theirs = hidden[first + n, column : column + width]
             for c in range(width):
                 mine[c] = mine[c] if theirs[c] > _ZERO else _ZERO
-        part = next_job(jobs, parts)
+        chunk = next_job(jobs, chunks)
 
 
 @kernel
@@ -122,10 +122,10 @@ def gather(
         out_colors: [G, 3] written, raw.
     """
     anchors, slots = len(covariances), opacities.shape[1]
-    parts = (anchors + SHARE - 1) // SHARE
-    part = next_job(jobs, parts)
-    while part < parts:
-        for n in range(part * SHARE, min(anchors, (part + 1) * SHARE)):
+    chunks = (anchors + SHARE - 1) // SHARE
+    chunk = next_job(jobs, chunks)
+    while chunk < chunks:
+        for n in range(chunk * SHARE, min(anchors, (chunk + 1) * SHARE)):
             a = first + n
             g, p = starts[a], rows[a]
             for j in range(slots):
@@ -140,7 +140,7 @@ def gather(
                     for c in range(4):
                         out_quats[g, c] = covariances[n, COVARIANCE * j + 3 + c]
                     g += 1
-        part = next_job(jobs, parts)
+        chunk = next_job(jobs, chunks)
 
 
 @kernel
@@ -192,10 +192,10 @@ def scatter(
     """
     slots = tanhs.shape[1]
     to_colors = (1 + COVARIANCE) * slots
-    parts = (anchors + SHARE - 1) // SHARE
-    part = next_job(jobs, parts)
-    while part < parts:
-        for n in range(part * SHARE, min(anchors, (part + 1) * SHARE)):
+    chunks = (anchors + SHARE - 1) // SHARE
+    chunk = next_job(jobs, chunks)
+    while chunk < chunks:
+        for n in range(chunk * SHARE, min(anchors, (chunk + 1) * SHARE)):
             a = first + n
             p = rows[a]
             raw[n] = _ZERO
@@ -215,7 +215,7 @@ def scatter(
                     raw[n, rgb + c] = v_colors[g, c] * color * (_ONE - color)
                 for c in range(4):
                     raw[n, cov + 3 + c] = v_quats[g, c]
-        part = next_job(jobs, parts)
+        chunk = next_job(jobs, chunks)
 
 
 @kernel
@@ -233,10 +233,10 @@ def scatter_scales(
     raw: _Floats,
 ) -> None:
     """Run `scatter` for scale gradients only; `raw` [n, 7 k] is the covariances' gradient."""
-    parts = (anchors + SHARE - 1) // SHARE
-    part = next_job(jobs, parts)
-    while part < parts:
-        for n in range(part * SHARE, min(anchors, (part + 1) * SHARE)):
+    chunks = (anchors + SHARE - 1) // SHARE
+    chunk = next_job(jobs, chunks)
+    while chunk < chunks:
+        for n in range(chunk * SHARE, min(anchors, (chunk + 1) * SHARE)):
             a = first + n
             p = rows[a]
             raw[n] = _ZERO
@@ -246,4 +246,4 @@ def scatter_scales(
                     by_log = v_scales[g, c] * shares[g, c] * spreads[a, 3 + c]
                     out_log_scales[p, 3 + c] += by_log
                     raw[n, cov + c] = by_log * (_ONE - shares[g, c])
-        part = next_job(jobs, parts)
+        chunk = next_job(jobs, chunks)

@@ -29,10 +29,10 @@ _CANDIDATES: Final = 16
 def examine(subject: Subject, batch: Batch) -> list[Finding]:
     """Run an operator on a batch and judge every result."""
     with np.errstate(all="ignore"):
-        found = results(subject.operator, batch)
+        outputs = results(subject.operator, batch)
         return [
-            _judged(subject, exact_case(batch, place), torch.from_numpy(found[place]), apart)
-            for place, apart in enumerate(_from_laws(subject, batch, found))
+            _judged(subject, exact_case(batch, index), torch.from_numpy(outputs[index]), apart)
+            for index, apart in enumerate(_from_laws(subject, batch, outputs))
         ]
 
 
@@ -49,22 +49,22 @@ def exact_case(batch: Batch, place: int) -> ExactCase:
     return ExactCase(short(batch.family, batch.rows[place], batch.dtype))
 
 
-def _from_laws(subject: Subject, batch: Batch, found: Floats) -> list[float] | list[None]:
+def _from_laws(subject: Subject, batch: Batch, outputs: Floats) -> list[float] | list[None]:
     """Return [B] errors of scaling with the gradients, and of the order of two views.
 
     The result is None for operators that have a reference.
     """
     if subject.reference.oracle is not None or subject.reference.rule is not None:
-        return [None] * len(found)
+        return [None] * len(outputs)
     views = search_views(batch.views)
     scaled = results(subject.operator, replace(batch, rows=batch.rows * _SCALE), views) / _SCALE
-    apart = np.linalg.norm(scaled - found, axis=1)
+    apart = np.linalg.norm(scaled - outputs, axis=1)
     # At nearly singular Gramians the order may matter; the Gramians of usual gradients are far from
     # singular.
     if batch.family == USUAL and batch.views == 2:  # noqa: PLR2004
         turned = Views(views.labels[::-1], views.ratios[::-1], views.seed)
         other = results(subject.operator, replace(batch, rows=batch.rows[:, ::-1]), turned)
-        apart = np.maximum(apart, np.linalg.norm(other - found, axis=1))
+        apart = np.maximum(apart, np.linalg.norm(other - outputs, axis=1))
     return [float(distance) for distance in apart]
 
 
@@ -84,9 +84,9 @@ def largest_jump(
         gap = results(subject.operator, moved) - results(subject.operator, wide)
         jump = np.linalg.norm(gap, axis=1) / np.linalg.norm(batch.rows, axis=2).max(axis=1)
     jump = np.where(np.isfinite(jump), jump, 0.0)
-    for place in np.argsort(-jump)[:_CANDIDATES].tolist():
-        if _is_continuous(subject, exact_case(wide, place)):
-            return place, float(jump[place])
+    for index in np.argsort(-jump)[:_CANDIDATES].tolist():
+        if _is_continuous(subject, exact_case(wide, index)):
+            return index, float(jump[index])
     return None
 
 

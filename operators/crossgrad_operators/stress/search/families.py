@@ -185,13 +185,13 @@ def _results(operator: Operator, rows: Rows, dtype: torch.dtype, views: Views) -
     ]
     context = context_of(gradients, (BLOCK,), views)
     try:
-        found = operator.aggregate(context, EMPTY_STATE)[0].gradients[BLOCK.name]
+        combined = operator.aggregate(context, EMPTY_STATE)[0].gradients[BLOCK.name]
     except Exception:
         # Third-party code may raise anything.
         return _halved(operator, rows, dtype, views)
-    if found is None:
+    if combined is None:
         return np.full(rows[:, 0].shape, np.nan)
-    result: Rows = found.detach().double().numpy()
+    result: Rows = combined.detach().double().numpy()
     return result
 
 
@@ -200,5 +200,5 @@ def _halved(operator: Operator, rows: Rows, dtype: torch.dtype, views: Views) ->
     if len(rows) == 1:
         return np.full(rows[:, 0].shape, np.nan)
     half = len(rows) // 2
-    parts = (rows[:half], rows[half:])
-    return np.concatenate([_results(operator, part, dtype, views) for part in parts])
+    halves = (rows[:half], rows[half:])
+    return np.concatenate([_results(operator, half_rows, dtype, views) for half_rows in halves])

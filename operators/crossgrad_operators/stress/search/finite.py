@@ -52,13 +52,13 @@ def run_finite(
     for turn, first in enumerate(range(0, matrices, BATCH)):
         dtype = dtypes[turn % len(dtypes)]
         batch = _batch(subject, dtype, min(BATCH, matrices - first), (seed, turn))
-        found = results(subject.operator, batch)
-        wrong = np.asarray(~np.isfinite(found).all(axis=1))
+        outputs = results(subject.operator, batch)
+        wrong = np.asarray(~np.isfinite(outputs).all(axis=1))
         bad += int(wrong.sum())
         if wrong.any() and example is None:
             rows = batch.rows[int(np.argmax(wrong))].copy()
             example = Sample(rows, batch.dtype, batch.family, turn, float("inf"))
-        longest = max(longest, _longest(batch, np.where(wrong[:, None], 0.0, found)))
+        longest = max(longest, _longest(batch, np.where(wrong[:, None], 0.0, outputs)))
     return Finite(subject.name, matrices, bad, longest, perf_counter() - start, example)
 
 
@@ -73,10 +73,10 @@ def _batch(subject: Subject, dtype: torch.dtype, count: int, seed: tuple[int, in
     return Batch(rounded(rows, dtype), dtype, family)
 
 
-def _longest(batch: Batch, found: np.ndarray) -> float:
+def _longest(batch: Batch, outputs: np.ndarray) -> float:
     """Return the largest |u| divided by the longest gradient."""
     length = np.linalg.norm(batch.rows, axis=2).max(axis=1)
-    ratio = np.linalg.norm(found, axis=1) / np.where(length > 0, length, 1.0)
+    ratio = np.linalg.norm(outputs, axis=1) / np.where(length > 0, length, 1.0)
     return float(ratio.max(initial=0.0))
 
 
@@ -84,15 +84,15 @@ def as_text(found: Sequence[Finite]) -> str:
     """Return one line per operator, and the rows of an example that is not finite."""
     head = f"{'operator':<16}{'matrices':>10}{'not finite':>12}{'longest |u|':>13}{'seconds':>9}"
     lines = [
-        f"{each.operator:<16}{each.matrices:>10}{each.not_finite:>12}{each.longest:>13.3g}"
-        f"{each.seconds:>9.1f}"
-        for each in found
+        f"{result.operator:<16}{result.matrices:>10}{result.not_finite:>12}{result.longest:>13.3g}"
+        f"{result.seconds:>9.1f}"
+        for result in found
     ]
     bad = [
-        f"{each.operator}, {each.example.precision}, {each.example.family}, batch "
-        f"{each.example.turn}: not finite\n  --rows '{each.example.text()}'"
-        for each in found
-        if each.example is not None
+        f"{result.operator}, {result.example.precision}, {result.example.family}, batch "
+        f"{result.example.turn}: not finite\n  --rows '{result.example.text()}'"
+        for result in found
+        if result.example is not None
     ]
     legend = "longest |u|: relative to the longest gradient of its case"
     return "\n".join([head, *lines, legend, *bad])
@@ -102,12 +102,12 @@ def write_csv(found: Sequence[Finite], path: Path) -> None:
     """Write one row per operator."""
     rows: list[dict[str, str | int | float]] = [
         {
-            "operator": each.operator,
-            "matrices": each.matrices,
-            "not_finite": each.not_finite,
-            "u_longest": each.longest,
-            "seconds": round(each.seconds, 1),
+            "operator": result.operator,
+            "matrices": result.matrices,
+            "not_finite": result.not_finite,
+            "u_longest": result.longest,
+            "seconds": round(result.seconds, 1),
         }
-        for each in found
+        for result in found
     ]
     write_table(path, rows)

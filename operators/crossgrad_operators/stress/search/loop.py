@@ -61,20 +61,20 @@ def search(
         UserError: mpmath is not installed.
     """
     mpmath = require_mpmath()
-    tallies = [[WorstCases(each.name, dtype) for each in subjects] for dtype in extent.dtypes]
+    tallies = [[WorstCases(subject.name, dtype) for subject in subjects] for dtype in extent.dtypes]
     every = [tally for group in tallies for tally in group]
     end, turn = monotonic() + extent.seconds, 0
     with mpmath.mp.workdps(DIGITS), on_one_thread():
         while turn == 0 or (monotonic() < end and turn != extent.rounds):
-            place = turn % len(extent.dtypes)
+            index = turn % len(extent.dtypes)
             batch = fresh(extent, turn)
-            for subject, tally in zip(subjects, tallies[place], strict=True):
+            for subject, tally in zip(subjects, tallies[index], strict=True):
                 _round(subject, tally, batch, (extent.seed, turn))
             turn += 1
             progress(turn, every)
-        for place, subject in enumerate(subjects):
+        for index, subject in enumerate(subjects):
             for group in tallies:
-                _simplify(subject, group[place])
+                _simplify(subject, group[index])
     return every
 
 
@@ -87,11 +87,11 @@ def _simplify(subject: Subject, tally: WorstCases) -> None:
 
 def fresh(extent: Extent, turn: int) -> Batch:
     """Return the gradients of a round."""
-    place, index = turn % len(extent.dtypes), turn // len(extent.dtypes)
+    type_index, cycle = turn % len(extent.dtypes), turn // len(extent.dtypes)
     rng = np.random.default_rng([extent.seed, turn])
-    family = list(FAMILIES)[index % len(FAMILIES)]
+    family = list(FAMILIES)[cycle % len(FAMILIES)]
     views, elements = sizes(rng, family)
-    dtype = extent.dtypes[place]
+    dtype = extent.dtypes[type_index]
     rows = FAMILIES[family](rng, max(JUMPS, cases_of(views)), views, elements)
     return Batch(rounded(rows, dtype), dtype, family)
 
@@ -147,11 +147,11 @@ def shrunk(subject: Subject, specimen: Sample, *, inside: bool) -> Sample:
 
 def _smaller(subject: Subject, rows: Rows, dtype: torch.dtype) -> Iterator[Rows]:
     """Yield cases with fewer rows or elements (half, a quarter, ... one), then fewer digits."""
-    for part in _parts(len(rows), least=2):
-        if subject.operator.views.admits(len(rows) - len(part)):
-            yield np.delete(rows, part, axis=0)
-    for part in _parts(rows.shape[1], least=1):
-        yield np.delete(rows, part, axis=1)
+    for removed in _parts(len(rows), least=2):
+        if subject.operator.views.admits(len(rows) - len(removed)):
+            yield np.delete(rows, removed, axis=0)
+    for removed in _parts(rows.shape[1], least=1):
+        yield np.delete(rows, removed, axis=1)
     for digits in FEW_DIGITS:
         short = rounded(_to_digits(rows, digits), dtype)
         if not np.array_equal(short, rows):
@@ -163,9 +163,9 @@ def _parts(count: int, least: int) -> Iterator[range]:
     size = count // 2
     while size:
         for first in range(0, count, size):
-            part = range(first, min(first + size, count))
-            if count - len(part) >= least:
-                yield part
+            indices = range(first, min(first + size, count))
+            if count - len(indices) >= least:
+                yield indices
         size //= 2
 
 

@@ -55,7 +55,7 @@ def _row(tally: WorstCases) -> dict[str, str | int | float]:
         "operator": tally.operator,
         "type": tally.precision,
         **{name: getattr(tally, name) for name in COUNTS},
-        **{name: each.value if each else "" for name, each in figures},
+        **{name: sample.value if sample else "" for name, sample in figures},
     }
 
 

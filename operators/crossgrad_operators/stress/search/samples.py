@@ -71,8 +71,10 @@ def mutants(rng: np.random.Generator, parents: Sequence[Sample], admitted: ViewC
     pieces = np.array_split(batch, len(MUTATIONS))
     # The order is random because the last pieces of a small batch are empty.
     order = rng.permutation(len(MUTATIONS)).tolist()
-    found = [MUTATIONS[place](rng, piece) for place, piece in zip(order, pieces, strict=True)]
-    result = rounded(np.nan_to_num(np.concatenate(found)), parent.dtype)
+    variants = [
+        MUTATIONS[mutation](rng, piece) for mutation, piece in zip(order, pieces, strict=True)
+    ]
+    result = rounded(np.nan_to_num(np.concatenate(variants)), parent.dtype)
     return Batch(result, parent.dtype, parent.family.removesuffix(MUTATED) + MUTATED)
 
 
@@ -93,11 +95,11 @@ def _approach(rng: np.random.Generator, rows: Rows) -> Rows:
     """Replace a row by plus or minus another row plus a share of itself."""
     blocks, views, _ = rows.shape
     one, other = rng.integers(views, size=(2, blocks))
-    place = np.arange(blocks)
+    every_block = np.arange(blocks)
     sign = rng.choice([-1.0, 1.0], (blocks, 1))
     share = 10.0 ** rng.uniform(-16, 0, (blocks, 1))
     result = rows.copy()
-    result[place, one] = sign * rows[place, other] + share * rows[place, one]
+    result[every_block, one] = sign * rows[every_block, other] + share * rows[every_block, one]
     return result
 
 

@@ -83,11 +83,11 @@ class WorstCases:
         self.inside_pool = _worst(self.inside_pool, batch, errors, turn)
         ratios = [severity(finding, inside=False) for finding in findings]
         self.outside_pool = _worst(self.outside_pool, batch, ratios, turn)
-        for place, finding in enumerate(findings):
+        for index, finding in enumerate(findings):
             self.unproven += finding.reason == UNPROVEN
             self.not_finite += finding.reason == NOT_FINITE
             if finding.verdict == "failed" and finding.reason != UNPROVEN:
-                self.fail(specimen(batch, place, turn), finding.reason)
+                self.fail(specimen(batch, index, turn), finding.reason)
 
     def fail(self, sample: Sample, reason: str) -> None:
         """Count a case that breaks a promise. The first such cases are stored for the report."""
@@ -112,8 +112,8 @@ def severity(finding: Finding, *, inside: bool) -> float:
     if not inside:
         return finding.ratio if finding.is_outside else 0.0
     excused = finding.is_outside or finding.verdict == "undetermined"
-    known = not (excused or isnan(finding.error) or finding.reason == NOT_FINITE)
-    return finding.error if known else 0.0
+    is_counted = not (excused or isnan(finding.error) or finding.reason == NOT_FINITE)
+    return finding.error if is_counted else 0.0
 
 
 def specimen(batch: Batch, place: int, turn: int, value: float = 0.0) -> Sample:
@@ -124,9 +124,9 @@ def specimen(batch: Batch, place: int, turn: int, value: float = 0.0) -> Sample:
 def _worst(pool: list[Sample], batch: Batch, values: Sequence[float], turn: int) -> list[Sample]:
     """Return the worst cases of a pool and a batch together."""
     last = pool[-1].value if len(pool) == POOL else 0.0
-    ranked = sorted(range(len(values)), key=lambda place: -values[place])
-    places = [place for place in ranked[:2] if values[place] > last]
-    if not places:
+    ranked = sorted(range(len(values)), key=lambda index: -values[index])
+    worst = [index for index in ranked[:2] if values[index] > last]
+    if not worst:
         return pool
-    found = [specimen(batch, place, turn, values[place]) for place in places]
-    return sorted([*pool, *found], key=lambda each: -each.value)[:POOL]
+    specimens = [specimen(batch, index, turn, values[index]) for index in worst]
+    return sorted([*pool, *specimens], key=lambda sample: -sample.value)[:POOL]

@@ -22,13 +22,13 @@ def counter(meta: Mapping[str, Any], view: int) -> Callable[[Tensor], Tensor]:
         meta: The metadata that gsplat's `rasterization` returns.
         view: Index of the view among the K views.
     """
-    known: dict[str, Tensor] = {name: meta[name].detach() for name in _NAMES}
+    projected: dict[str, Tensor] = {name: meta[name].detach() for name in _NAMES}
     width, height, tile_size = meta["width"], meta["height"], meta["tile_size"]
 
     def count(marked: Tensor) -> Tensor:
         from gsplat import rasterize_to_indices_in_range
 
-        opacities = known["opacities"]
+        opacities = projected["opacities"]
         total: Tensor = opacities.new_zeros(opacities.shape[-1], dtype=torch.int64)
         rows = max(1, PIXELS // width)
         for first in range(0, height, rows):
@@ -37,20 +37,20 @@ def counter(meta: Mapping[str, Any], view: int) -> Callable[[Tensor], Tensor]:
             light = opacities.new_zeros((*opacities.shape[:-1], height, width))
             band = slice(first, first + rows)
             light[view, 0, band] = marked[band].to(light)
-            found, _, _ = rasterize_to_indices_in_range(
+            gaussian_ids, _, _ = rasterize_to_indices_in_range(
                 0,
                 _ALL,
                 light,
-                known["means2d"],
-                known["conics"],
+                projected["means2d"],
+                projected["conics"],
                 opacities,
                 width,
                 height,
                 tile_size,
-                known["isect_offsets"],
-                known["flatten_ids"],
+                projected["isect_offsets"],
+                projected["flatten_ids"],
             )
-            total += torch.bincount(found, minlength=len(total))
+            total += torch.bincount(gaussian_ids, minlength=len(total))
         return total.int()
 
     return count

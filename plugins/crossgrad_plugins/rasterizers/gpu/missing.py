@@ -47,13 +47,13 @@ def compiler_missing(package: str) -> str | None:
         return (
             f"rasterizer {package} compiles its kernels, and no C++ compiler was found: install g++"
         )
-    found = nvcc_version(nvcc)
-    if found is not None and wanted is not None and found.split(".")[0] != wanted.split(".")[0]:
+    version = nvcc_version(nvcc)
+    if version is not None and wanted is not None and version.split(".")[0] != wanted.split(".")[0]:
         return (
             f"rasterizer {package} cannot compile its kernels: nvcc ({nvcc}) belongs to "
-            f"CUDA {found}, but torch {torch.__version__} was built for CUDA {wanted}; "
+            f"CUDA {version}, but torch {torch.__version__} was built for CUDA {wanted}; "
             "install the toolkit of that version and set CUDA_HOME, or install a torch "
-            f"that was built for CUDA {found}"
+            f"that was built for CUDA {version}"
         )
     return None
 
@@ -61,8 +61,8 @@ def compiler_missing(package: str) -> str | None:
 def is_compiled(package: str) -> bool:
     """Return True if a package is installed with compiled kernels; the package is not imported."""
     spec = find_spec(package)
-    places = [] if spec is None else spec.submodule_search_locations or []
-    return any(path for place in places for path in Path(place).glob("csrc.*"))
+    folders = [] if spec is None else spec.submodule_search_locations or []
+    return any(path for folder in folders for path in Path(folder).glob("csrc.*"))
 
 
 @cache
@@ -96,8 +96,8 @@ def _cuda_home() -> str:
 def nvcc_version(nvcc: Path) -> str | None:
     """Return the CUDA version of a compiler, such as 12.4; None if it cannot be determined."""
     try:
-        told = subprocess.run([nvcc, "--version"], capture_output=True, text=True, check=True)
+        completed = subprocess.run([nvcc, "--version"], capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return None
-    found = re.search(r"release (\d+\.\d+)", told.stdout)
-    return found and found.group(1)
+    match = re.search(r"release (\d+\.\d+)", completed.stdout)
+    return match and match.group(1)

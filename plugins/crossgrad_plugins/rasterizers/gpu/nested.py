@@ -66,16 +66,20 @@ class _Nested(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor | None) -> Any:
         drawing: Drawing = ctx.drawing
         pairs = zip(drawing.outputs, gradients, strict=True)
-        known = [(output, g) for output, g in pairs if g is not None and output.requires_grad]
-        wanted = [each for each in (drawing.centers, *ctx.leaves) if each.requires_grad]
-        found = torch.autograd.grad(
-            [output for output, _ in known],
+        with_gradient = [
+            (output, g) for output, g in pairs if g is not None and output.requires_grad
+        ]
+        wanted = [tensor for tensor in (drawing.centers, *ctx.leaves) if tensor.requires_grad]
+        input_gradients = torch.autograd.grad(
+            [output for output, _ in with_gradient],
             wanted,
-            [gradient for _, gradient in known],
+            [gradient for _, gradient in with_gradient],
             retain_graph=True,  # Another backward pass may follow.
             allow_unused=True,
         )
-        by_tensor = {id(each): gradient for each, gradient in zip(wanted, found, strict=True)}
+        by_tensor = {
+            id(tensor): gradient for tensor, gradient in zip(wanted, input_gradients, strict=True)
+        }
         if (of_centers := by_tensor.get(id(drawing.centers))) is not None:
             ctx.call.observe(drawing.centers, of_centers)
         return None, *(by_tensor.get(id(leaf)) for leaf in ctx.leaves)

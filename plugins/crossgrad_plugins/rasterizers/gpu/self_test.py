@@ -52,12 +52,12 @@ def self_test(rasterizer: Rasterizer, device: str) -> None:
     for harmonics in (False, True):
         expected = look_at(_reference(rasterizer), "cpu", harmonics=harmonics)
         try:
-            found = look_at(rasterizer, device, harmonics=harmonics)
+            look = look_at(rasterizer, device, harmonics=harmonics)
         except UserError:
             raise
         except Exception as error:
             raise _refused(rasterizer, "cannot draw", f"{type(error).__name__}: {error}") from error
-        if wrong := difference(found, expected):
+        if wrong := difference(look, expected):
             raise _refused(rasterizer, "renders a known scene incorrectly", wrong)
 
 
@@ -94,9 +94,9 @@ def look_at(rasterizer: Rasterizer, device: str, *, harmonics: bool) -> Look:
     loss = (image - ramp).square().mean()
     loss.backward()  # type: ignore[no-untyped-call]
     tensors = {name: getattr(gaussians, name) for name in _TENSORS}
-    gradients = {name: each.grad for name, each in tensors.items() if each is not None}
-    known = {name: g.cpu() for name, g in gradients.items() if g is not None}
-    return Look(image.detach().cpu(), float(loss.detach()), known)
+    gradients = {name: tensor.grad for name, tensor in tensors.items() if tensor is not None}
+    cpu_gradients = {name: g.cpu() for name, g in gradients.items() if g is not None}
+    return Look(image.detach().cpu(), float(loss.detach()), cpu_gradients)
 
 
 def difference(found: Look, expected: Look) -> str:

@@ -230,12 +230,12 @@ def sum_up(
     basis = load_wide(bases, row)
     last = load_wide(rest, at + _LAST)
     # Only lanes 0 to 14 are used.
-    found = _spread_first(basis, basis) * load_wide(rest, at)
-    found = fma(_spread_second(basis, basis), load_wide(rest, at + _SECOND), found)
+    partial_sums = _spread_first(basis, basis) * load_wide(rest, at)
+    partial_sums = fma(_spread_second(basis, basis), load_wide(rest, at + _SECOND), partial_sums)
     product = _spread_last(basis, basis) * last
-    found = found + _onwards(product, product)
-    two = found + _six_on(found, found)
-    store(colours, row, (two + _three_on(two, two)) + _twelve_on(two, found))
+    partial_sums = partial_sums + _onwards(product, product)
+    two = partial_sums + _six_on(partial_sums, partial_sums)
+    store(colours, row, (two + _three_on(two, two)) + _twelve_on(two, partial_sums))
 
 
 @device

@@ -136,7 +136,7 @@ def _spans(
     ellipses: NDArray[np.float32],
     begins: NDArray[np.float32],
     ends: NDArray[np.float32],
-    place: int,
+    lane: int,
 ) -> None:
     """Write the first and last reached tile in eight rows of tiles (first > last means none).
 
@@ -167,8 +167,8 @@ def _spans(
     first = round_up(fma(slope, left, u) - left_extent)
     last = round_down(fma(slope, right, u) + right_extent)
     empty = splat(np.float32(-1.0))
-    store(begins, place, _tile(first, TILE_WIDTH))
-    store(ends, place, where((top <= bottom) & (first <= last), _tile(last, TILE_WIDTH), empty))
+    store(begins, lane, _tile(first, TILE_WIDTH))
+    store(ends, lane, where((top <= bottom) & (first <= last), _tile(last, TILE_WIDTH), empty))
 
 
 @device
@@ -193,17 +193,17 @@ def _find(
     Returns:
         The number of tiles.
     """
-    place = k * LANES
+    lane = k * LANES
     left, right = np.float32(boxes[j, 0]), np.float32(boxes[j, 1] - 1)
     slot = first_slot
     for block in range(boxes[j, 2], boxes[j, 3], LANES):
         if boxed:
-            begins[place : place + LANES], ends[place : place + LANES] = left, right
+            begins[lane : lane + LANES], ends[lane : lane + LANES] = left, right
         elif block > boxes[j, 2]:
-            _spans(j * RECORD, k, block, records, ellipses, begins, ends, place)
+            _spans(j * RECORD, k, block, records, ellipses, begins, ends, lane)
         for row in range(min(LANES, boxes[j, 3] - block)):
-            begin = np.intp(max(left, begins[place + row]))
-            end = np.intp(min(right, ends[place + row]))
+            begin = np.intp(max(left, begins[lane + row]))
+            end = np.intp(min(right, ends[lane + row]))
             if begin > end:
                 continue
             tile = (block + row) * tile_columns + begin

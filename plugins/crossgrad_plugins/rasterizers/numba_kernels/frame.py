@@ -221,7 +221,7 @@ def _directions(
         projected.owners,
         axes,
     )
-    found = np.empty(lists.slots * SUMS, np.float32)
+    slot_sums = np.empty(lists.slots * SUMS, np.float32)
     parallel(
         bin_directions,
         lists.starts,
@@ -237,7 +237,7 @@ def _directions(
         None if v_alpha is None else np.ascontiguousarray(v_alpha, np.float32),
         None if v_depth is None else np.ascontiguousarray(v_depth, np.float32),
         analytic,
-        found,
+        slot_sums,
     )
     directions = np.zeros((gaussians.means.shape[0], BINS, FIELDS), np.float32)
     parallel(
@@ -247,7 +247,7 @@ def _directions(
         projected.owners,
         lists.buckets,
         written,
-        found,
+        slot_sums,
         directions,
     )
     return directions

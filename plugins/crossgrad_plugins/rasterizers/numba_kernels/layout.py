@@ -106,9 +106,9 @@ def vector_constants(max_alpha: float) -> NDArray[np.float32]:
     room = np.empty(len(flat) + WIDE, np.float32)
     shift = -(room.ctypes.data // room.itemsize) % WIDE
     # The array starts at a cache line, so that no vector crosses two lines.
-    found = room[shift : shift + len(flat)]
-    found[:] = flat
-    return found
+    constants = room[shift : shift + len(flat)]
+    constants[:] = flat
+    return constants
 
 
 @device

@@ -134,14 +134,14 @@ def _picked(
         if flags[k]:
             chosen[count] = begin + k
             count += 1
-    for place in range(count):
-        i = chosen[place]
+    for row in range(count):
+        i = chosen[row]
         for axis in range(3):
-            picked[3 * place + axis] = means[i, axis]
-            picked[7 * BLOCK + 3 * place + axis] = scales[i, axis]
+            picked[3 * row + axis] = means[i, axis]
+            picked[7 * BLOCK + 3 * row + axis] = scales[i, axis]
         for axis in range(4):
-            picked[3 * BLOCK + 4 * place + axis] = quats[i, axis]
-        picked[10 * BLOCK + place] = opacities[i]
+            picked[3 * BLOCK + 4 * row + axis] = quats[i, axis]
+        picked[10 * BLOCK + row] = opacities[i]
     return count
 
 
@@ -154,7 +154,7 @@ def _project_block(
     means: NDArray[np.float32],
     quats: NDArray[np.float32],
     scales: NDArray[np.float32],
-    found: NDArray[np.float64],
+    projected: NDArray[np.float64],
 ) -> None:
     """Project the first `count` Gaussians, visible or not, in a branch-free, vectorised loop.
 
@@ -172,14 +172,14 @@ def _project_block(
         turned = rotation(unit)
         m, n = times(in_axes(row_x, turned), scale), times(in_axes(row_y, turned), scale)
         a, b, c, det, factor = covariance(m, n, dilation, antialiased)
-        put(found, CAMERA_DEPTH, k, z)
-        put(found, MEAN_U, k, camera.fx * x * inverse_z + camera.cx)
-        put(found, MEAN_V, k, camera.fy * y * inverse_z + camera.cy)
-        put(found, VARIANCE_X, k, a)
-        put(found, COVARIANCE, k, b)
-        put(found, VARIANCE_Y, k, c)
-        put(found, DETERMINANT, k, det if inverse_norm > 0.0 else -1.0)
-        put(found, FACTOR, k, factor)
+        put(projected, CAMERA_DEPTH, k, z)
+        put(projected, MEAN_U, k, camera.fx * x * inverse_z + camera.cx)
+        put(projected, MEAN_V, k, camera.fy * y * inverse_z + camera.cy)
+        put(projected, VARIANCE_X, k, a)
+        put(projected, COVARIANCE, k, b)
+        put(projected, VARIANCE_Y, k, c)
+        put(projected, DETERMINANT, k, det if inverse_norm > 0.0 else -1.0)
+        put(projected, FACTOR, k, factor)
 
 
 @device
@@ -212,7 +212,7 @@ def _record_block(
     limits: NDArray[np.int32] | None,
     opacities: NDArray[np.float32],
     colors: NDArray[np.float32] | None,
-    found: NDArray[np.float64],
+    projected: NDArray[np.float64],
     radii: NDArray[np.int32],
     records: NDArray[np.float32],
     depths: NDArray[np.float64],
@@ -224,26 +224,28 @@ def _record_block(
     width, height = camera.width, camera.height
     for k in range(chosen.size):
         i = chosen[k]
-        opacity, z = np.float64(opacities[i]), get(found, CAMERA_DEPTH, k)
+        opacity, z = np.float64(opacities[i]), get(projected, CAMERA_DEPTH, k)
         within = (0.0, width - 1.0, 0.0, height - 1.0)
         if limits is not None:
-            published, within = square(k, width, height, found)
+            published, within = square(k, width, height, projected)
             if z > near and z < math.inf:
                 # The Gaussian is visible for the published code, even if it touches no pixel.
                 radii[i] = published
         if not (z > near and z < math.inf and opacity >= ALPHA_THRESHOLD and opacity < math.inf):
             continue
         if analytic is None:
-            radius, pixels, plain = plain_shape(k, width, height, within, found)
+            radius, pixels, plain = plain_shape(k, width, height, within, projected)
         else:
-            radius, pixels, turned = analytic_shape(k, opacity, width, height, within, found)
+            radius, pixels, turned = analytic_shape(k, opacity, width, height, within, projected)
         if radius == 0 or (colors is not None and not _write_color(i, j, colors, records)):
             continue
         if analytic is None:
             write_plain(j, plain, records)
         else:
             write_analytic(j, turned, records)
-        place_record(j, get(found, MEAN_U, k), get(found, MEAN_V, k), pixels, records, boxes)
+        place_record(
+            j, get(projected, MEAN_U, k), get(projected, MEAN_V, k), pixels, records, boxes
+        )
         if limits is None:
             radii[i] = radius
         else:
@@ -260,11 +262,11 @@ def _record_block(
 def listed(drawn: NDArray[np.int64], owners: NDArray[np.int32]) -> NDArray[np.int32]:
     """Return [R] the Gaussians that have a record, sorted."""
     rows = np.empty(drawn.sum(), np.int32)
-    place = 0
+    next_row = 0
     for chunk in range(drawn.shape[0]):
         for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
-            rows[place] = owners[j]
-            place += 1
+            rows[next_row] = owners[j]
+            next_row += 1
     return rows
 
 
@@ -319,7 +321,7 @@ def project(
         room: [chunks] written: tiles in the boxes of each chunk.
     """
     count = means.shape[0]
-    found = np.empty(FOUND * BLOCK, np.float64)
+    projected = np.empty(FOUND * BLOCK, np.float64)
     flags = np.ones(BLOCK, np.uint8)
     chosen = np.empty(BLOCK, np.int64)
     picked = np.empty(11 * BLOCK, np.float32)
@@ -351,10 +353,10 @@ def project(
                 picked,
                 picked[3 * BLOCK :],
                 picked[7 * BLOCK :],
-                found,
+                projected,
             )
             if analytic is None:
-                shape_block(left, picked[10 * BLOCK :], found)
+                shape_block(left, picked[10 * BLOCK :], projected)
             end = _record_block(
                 chosen[:left],
                 end,
@@ -364,7 +366,7 @@ def project(
                 limits,
                 opacities,
                 colors,
-                found,
+                projected,
                 radii,
                 records,
                 depths,

@@ -210,11 +210,11 @@ def _fill_block(
         first, count = np.intp(buckets[j, FIRST_SLOT]), np.intp(buckets[j, SLOTS])
         i = np.intp(owners[j])
         j += 1
-        found = add_up(first, count, written, partials, sums)
+        has_gradient = add_up(first, count, written, partials, sums)
         v_colors[i, 0] = sums[SUM_RED]
         v_colors[i, 1] = sums[SUM_GREEN]
         v_colors[i, 2] = sums[SUM_BLUE]
-        if not found:
+        if not has_gradient:
             continue
         v_opacities[i] = np.float64(sums[SUM_1]) / np.float64(opacities[i])
         if v_absolute.shape[0] > 0:

@@ -27,16 +27,16 @@ def add_up(
     """
     zeros = written.shape[0]
     low, high = splat(np.float32(0.0)), splat(np.float32(0.0))
-    found = False
+    any_written = False
     for slot in range(first, first + count):
         prefetch(partials, min(slot + _AHEAD, zeros) * PARTIAL)
         row = slot if written[slot] else zeros
-        found |= row == slot
+        any_written |= row == slot
         low = low + load(partials, row * PARTIAL)
         high = high + load(partials, row * PARTIAL + LANES)
     store(sums, 0, low)
     store(sums, LANES, high)
-    return found
+    return any_written
 
 
 @kernel

@@ -56,18 +56,18 @@ def order_by_depth(depths: NDArray[np.float64], items: NDArray[np.int32]) -> NDA
         for digit in range(passes):
             bins[digit, (key >> (digit * of_digit)) & last_bin] += np.uint32(1)
     for digit in range(passes):
-        own, shift = bins[digit], of_place + digit * of_digit
+        digit_bins, shift = bins[digit], of_place + digit * of_digit
         position = np.uint32(0)
-        for k in range(own.shape[0]):
-            here = own[k]
-            own[k] = position
+        for k in range(digit_bins.shape[0]):
+            here = digit_bins[k]
+            digit_bins[k] = position
             position = np.uint32(position + here)
         for i in range(count):
-            each = packed[i]
-            k = (each >> shift) & last_bin
-            target = own[k]
-            own[k] = np.uint32(target + np.uint32(1))
-            spare[target] = each
+            entry = packed[i]
+            k = (entry >> shift) & last_bin
+            target = digit_bins[k]
+            digit_bins[k] = np.uint32(target + np.uint32(1))
+            spare[target] = entry
         packed, spare = spare, packed
     result = np.empty_like(items)
     for i in range(count):

@@ -140,15 +140,15 @@ class PixelCounter:
         """Return [N] int32, in how many of the marked pixels [H, W] each Gaussian was blended."""
         rows = self.lists.rows
         tiles = torch.split(self.table[rows], self.lists.sizes)
-        found = rows.new_zeros(len(rows))
+        blend_counts = rows.new_zeros(len(rows))
         first = 0
         for tile, centers in zip(tiles, _tile_centers(self.drawing.size, self.table), strict=True):
             column, row = centers.long().flatten(0, 1).unbind(-1)
             _, blended, _ = _blends(tile, centers.flatten(0, 1), self.drawing)
-            found[first : first + len(tile)] = blended[marked[row, column]].sum(0)
+            blend_counts[first : first + len(tile)] = blended[marked[row, column]].sum(0)
             first += len(tile)
         counts = rows.new_zeros(self.total)
-        return counts.index_add_(0, self.index[rows], found).int()
+        return counts.index_add_(0, self.index[rows], blend_counts).int()
 
 
 def _blends(table: Tensor, centers: Tensor, drawing: Drawing) -> tuple[Tensor, Tensor, Tensor]:
@@ -191,8 +191,8 @@ def tile_lists(boxes: Tensor, size: tuple[int, int]) -> TileLists:
     x0, y0, x1, y1 = boxes.unbind(-1)
     counts = (x1 - x0) * (y1 - y0)
     rows = torch.arange(len(boxes), device=boxes.device).repeat_interleave(counts)
-    place = torch.arange(len(rows), device=boxes.device) - (counts.cumsum(0) - counts)[rows]
+    number_in_box = torch.arange(len(rows), device=boxes.device) - (counts.cumsum(0) - counts)[rows]
     columns = (x1 - x0)[rows]
-    tiles = (y0[rows] + place // columns) * across + x0[rows] + place % columns
+    tiles = (y0[rows] + number_in_box // columns) * across + x0[rows] + number_in_box % columns
     order = tiles.argsort(stable=True)
     return TileLists(rows[order], torch.bincount(tiles, minlength=across * down).tolist())

@@ -161,5 +161,5 @@ def binned_directions(
     edges = torch.tensor(EDGES).to(along, non_blocking=True)
     bins = torch.bucketize(along, edges, right=True)
     fields = torch.cat([units, gradients.abs(), moved[None].to(units)])  # [FIELDS, P, G]
-    found = [torch.where(bins == number, fields, 0.0).sum(1) for number in range(BINS)]
-    return torch.stack(found).permute(2, 0, 1)
+    bin_sums = [torch.where(bins == number, fields, 0.0).sum(1) for number in range(BINS)]
+    return torch.stack(bin_sums).permute(2, 0, 1)

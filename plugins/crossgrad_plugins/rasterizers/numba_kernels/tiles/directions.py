@@ -115,9 +115,9 @@ def _add(binned: NDArray[np.float32], number: int, inside: Mask, value: Lanes) -
 
 
 @device
-def _bin(place: float) -> int:
+def _bin(position: float) -> int:
     """Return the bin of a position along the axis."""
-    return np.intp(min(max(np.floor(place), np.float32(-3.0)), np.float32(2.0))) + 3
+    return np.intp(min(max(np.floor(position), np.float32(-3.0)), np.float32(2.0))) + 3
 
 
 @device
@@ -260,10 +260,10 @@ def _entry(
     analytic: NDArray[np.float32] | None,
     places: NDArray[np.float32],
     binned: NDArray[np.float32],
-    found: NDArray[np.float32],
+    slot_sums: NDArray[np.float32],
     at: int,
 ) -> None:
-    """Write the sums of one Gaussian over the reached patches of a tile to found[at:]."""
+    """Write the sums of one Gaussian over the reached patches of a tile to slot_sums[at:]."""
     half = splat(np.float32(0.5))
     axis_x, axis_y = broadcast(axes, axis), broadcast(axes, axis + 1)
     # Pixel centres are at whole numbers here, as in `fill_rows`.
@@ -303,7 +303,7 @@ def _entry(
             load(binned, first + 6 * LANES),
             load(binned, first + 7 * LANES),
         )
-        store(found, at + group * LANES, eight)
+        store(slot_sums, at + group * LANES, eight)
 
 
 @kernel

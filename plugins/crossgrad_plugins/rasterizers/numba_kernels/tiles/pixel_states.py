@@ -249,10 +249,10 @@ def blend(
     blended = after >= load_wide(constants, STOPPED)
     store(state, at + PASSED, where(blended, after, load_wide(constants, FINISHED)))
     weight = where(blended, weight, zero)
-    own = weight * weighted_color
-    rest = load_wide(state, at + REST) - own
+    contribution = weight * weighted_color
+    rest = load_wide(state, at + REST) - contribution
     store(state, at + REST, rest)
-    s = fnma(rest, odds, own)
+    s = fnma(rest, odds, contribution)
     if capped is not None:
         blended = blended & (odds >= zero)
     return weight, where(blended, s, zero)
