@@ -55,7 +55,7 @@ def test_the_quick_answer_of_a_reader_does_not_import_the_reader(install, tmp_pa
 def test_a_reader_whose_quick_answer_fails_is_left_out(install, tmp_path, caplog):
     install(FAILS)
     assert not accepts("made-up", tmp_path)
-    assert "reader made-up left out: RuntimeError: no answer" in caplog.text
+    assert "reader made-up is not used: RuntimeError: no answer" in caplog.text
 
 
 def test_a_quick_answer_of_another_package_is_ignored(install):
@@ -80,5 +80,5 @@ def test_a_rasterizer_with_a_quick_answer_that_cannot_be_imported_is_left_out(
     monkeypatch.syspath_prepend(tmp_path)
     name, notes = choose_rasterizer("auto", Wanted("cpu", "plain"))
     assert name == "numba"
-    assert notes[0] == "rasterizer made-up left out: rasterizer made-up cannot be imported"
+    assert notes[0] == "rasterizer made-up is not used: rasterizer made-up cannot be imported"
     sys.modules.pop("made_up_speed", None)
