@@ -55,7 +55,7 @@ def test_the_quick_answer_of_a_reader_does_not_import_the_reader(install, tmp_pa
 def test_a_reader_whose_quick_answer_fails_is_left_out(install, tmp_path, caplog):
     install(FAILS)
     assert not accepts("made-up", tmp_path)
-    assert "reader made-up is not used: RuntimeError: no answer" in caplog.text
+    assert "reader made-up cannot be used: RuntimeError: no answer" in caplog.text
 
 
 def test_a_quick_answer_of_another_package_is_ignored(install):
