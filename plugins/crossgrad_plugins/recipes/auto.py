@@ -241,7 +241,7 @@ def growth(choice: Choice) -> list[Decision]:
         ),
     ]
     if "division" in type(choice.densifier).model_fields:
-        why = "two Gaussians on the longest axis leave no holes" if led else "as published"
+        why = "a split of the longest axis leaves no gap" if led else "as published"
         division, force = ("axis", "--set densifier.division=drawn") if led else ("drawn", "")
         rows.append(Decision("densifier.division", division, why, SCHEDULES, force))
     return rows

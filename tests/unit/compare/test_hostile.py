@@ -172,7 +172,7 @@ def test_a_single_seed_gives_an_inconclusive_verdict_with_the_reason(tmp_path):
     for views in (1, 2):
         RunFolder(views_per_step=views, final=20.0 + views).write(tmp_path / str(views))
     text = headlines(tmp_path)
-    assert "Inconclusive: views=2 is 1.00 dB ahead of views=1" in text
+    assert "Inconclusive: views=2 is 1.00 dB better than views=1" in text
     assert "one pair does not show the noise" in text
 
 
@@ -197,7 +197,7 @@ def test_a_single_arm_still_gets_a_page(tmp_path, capsys):
     RunFolder().write(tmp_path / "runs" / "only")
     app.compare([tmp_path / "runs"], Options(), None, skip_broken=False)
     page = (tmp_path / "runs" / "compare" / "index.html").read_text()
-    assert "There is only one arm: so nothing can be compared" in page
+    assert "There is only one arm, so nothing can be compared" in page
     assert "nothing can be compared" in capsys.readouterr().out
 
 
@@ -242,7 +242,7 @@ def test_a_file_given_as_a_folder_of_runs_is_refused(folder):
     grid.write_text("base: {}")
     with pytest.raises(UserError) as error:
         app.compare([grid], Options(), None, skip_broken=False)
-    assert (error.value.what, error.value.found) == ("no run to compare", "a file")
+    assert (error.value.what, error.value.found) == ("there is no run to compare", "a file")
 
 
 @pytest.mark.parametrize("name", ["margin", "target"])

@@ -175,7 +175,7 @@ def test_a_short_run_does_not_replace_a_missing_long_run(tmp_path):
     assert main["rate_factor=1"] == [("city", 0, 600), ("city", 1, 600)]
     assert [pair.seed for pair in found.ends[0].pairs] == [0, 1]
     assert found.left_out == {
-        "run-5": "has 300 steps, other runs of rate_factor=1 on city 600 steps"
+        "run-5": "has 300 steps, but other runs of rate_factor=1 on city have 600 steps"
     }
     # Its length is still a point of the frontier.
     assert {(point.length, point.seeds) for point in found.points} == {

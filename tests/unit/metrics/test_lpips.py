@@ -183,7 +183,7 @@ def refused(metric):
 
 def test_invalid_weight_files_are_refused_before_training(trunks, heads, tmp_path):
     head = heads / "alex.pth"
-    assert "no file" in refused(LPIPS(trunk=tmp_path / "none.pth", heads=head)).what
+    assert "does not exist" in refused(LPIPS(trunk=tmp_path / "none.pth", heads=head)).what
 
     junk = tmp_path / "junk.pth"
     junk.write_bytes(b"no weights")

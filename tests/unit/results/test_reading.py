@@ -84,7 +84,7 @@ def test_metrics_of_a_run_are_read_by_name_and_regime(folder: Path, result):
 )
 def test_a_damaged_per_view_table_is_named(folder: Path, content: str, found: str):
     (folder / "per_view.csv").write_text(content)
-    with pytest.raises(UserError, match=r"unreadable per_view.csv") as error:
+    with pytest.raises(UserError, match=r"per_view.csv cannot be read") as error:
         read_run(folder)
     assert found in error.value.found
     assert str(folder) in error.value.where

@@ -320,5 +320,5 @@ def test_an_average_of_other_tensors_is_refused(sums):
     setup = setup_of(**using(NAME, share=0.5))
     state, _ = trained(setup, steps=2)
     state.commit({NAME: PluginState({"count": 2}, sums)})
-    with pytest.raises(UserError, match="crossgrad_eval_parameters with something else"):
+    with pytest.raises(UserError, match="wrong type for the hook crossgrad_eval_parameters"):
         eval_parameters(setup, state)

@@ -69,7 +69,7 @@ def test_a_gpu_is_selected_if_a_rasterizer_works_and_the_trial_runs_once(on_a_gp
         f"device cuda: rasterizer gswarp works on {GPU} (use --device cpu to avoid it)",
     )
     assert tried.devices == ["cuda"]
-    assert "trying rasterizer gswarp on the GPU" in caplog.text
+    assert "testing rasterizer gswarp on the GPU" in caplog.text
 
 
 def test_a_gpu_without_a_rasterizer_gives_one_line_with_the_package_to_install(on_a_gpu):

@@ -223,7 +223,7 @@ def test_split_lists_make_test_every_unused(tmp_path):
     names = sorted(path.name for path in (scene / "images").iterdir())
     (scene / "test_list.txt").write_text(names[0])
     settings = {"scene": str(scene), "steps": 10, "out": str(tmp_path / "run")}
-    with pytest.raises(UserError, match=r"test_list\.txt decide"):
+    with pytest.raises(UserError, match=r"test_list\.txt determine"):
         run({**settings, "data": {"test_every": 4}}, dry_run=True)
     assert run({**settings, "data": {"test_every": 4, "split": "every"}}, dry_run=True) == 0
 
