@@ -399,7 +399,7 @@ def ends(choice: Choice) -> list[Decision]:
         Decision(
             "rules.floaters",
             {} if edits else False,
-            "no photo shows them, and they hide the scene" if edits else "the Gaussians stay",
+            "floaters that no photo shows hide the scene" if edits else "the Gaussians stay",
             "docs/floaters.md",
             "--no-rule floaters" if edits else "",
         ),
