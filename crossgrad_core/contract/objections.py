@@ -10,7 +10,7 @@ from crossgrad_core.contract.slots.rasterizer import Rasterizer
 
 
 def objections_to(selection: Selection) -> list[str]:
-    """Return reasons why the selection cannot work, for components of any author."""
+    """Return the core's reasons why the selected components cannot work together."""
     return [
         *_of_the_sampler(selection),
         *objections_to_views(selection.operator, selection),

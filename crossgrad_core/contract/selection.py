@@ -68,7 +68,7 @@ class Selection:
 
     @property
     def views(self) -> ViewsPerStepSpec:
-        """K over the run."""
+        """The number of views K of every step of the run."""
         return self.view_plan or ViewsPerStepSpec((self.views_per_step,))
 
     @property

@@ -36,9 +36,9 @@ class Backbone(Component):
         positions: Name of the tensor [N, 3] of the primitives' positions in the local frame. Before
             the first step and after steps with edits, the primitives are sorted in memory by
             position: all rows of all per-primitive tensors are sorted together, and `prepare` is
-            not called. At the end of a run, rows may be removed in the same way, after calls of
-            `decode` with some rows only (floaters). If the list is empty, rows are moved or removed
-            only by edits.
+            not called. At the end of a run, floaters may be removed in the same way; to find
+            floaters, `decode` is called with some of the rows only. If the name is empty, only
+            edits move or remove rows.
         axes: Names of two tensors, if each primitive is one Gaussian at its position: [N, 3]
             logarithms of standard deviations and [N, 4] rotations (wxyz, of any length). Positions
             may then be updated along these axes, and the deviations may be bounded. Empty if

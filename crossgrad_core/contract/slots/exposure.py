@@ -37,7 +37,8 @@ class Fitted:
 
     Attributes:
         exposure: The exposure that the run uses.
-        name: Name under which this exposure is installed; None if the choice did not change.
+        name: Name under which this exposure is installed; None if the run keeps the configured
+            exposure.
         notes: The decision on the exposure, and the evidence for it.
     """
 
@@ -50,9 +51,9 @@ class Exposure(Component):
     """A model that turns a render into the image that the camera of one photo would have taken.
 
     The parameters of an exposure belong to photos, not to the scene, so operators do not receive
-    their gradients. After each step, each photo of the step takes a separate Adam step with its own
-    step count, for any number of views and every backbone. Then all values are projected.
-    Checkpoints contain the values.
+    their gradients. After each step, the values of each photo in this step are updated by a
+    separate Adam step with its own step count. This holds for any number of views and every
+    backbone. Then the values of all photos are projected. Checkpoints contain the values.
     """
 
     slot: ClassVar[str] = "exposures"
@@ -88,16 +89,16 @@ class Exposure(Component):
     def project(self, values: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
         """Return all values [P, ...] after a step, projected to their valid range.
 
-        By default unchanged. For example, gains projected to a mean of zero do not change the
-        brightness of the scene.
+        By default the values are returned unchanged. For example, gains projected to a mean of zero
+        do not change the brightness of the scene.
         """
         return values
 
     def shift(self, name: str, values: Tensor, start: Tensor, end: Tensor) -> Tensor:
         """Return the values [P, ...] of a parameter, all changed as from `start` to `end`.
 
-        By default `end - start` is added. Differences between photos are kept at the level of the
-        values in a file.
+        By default `end - start` is added to every value. This moves the values of all photos to the
+        level of the values in a file, and keeps the differences between photos.
         """
         return values + (end - start)
 

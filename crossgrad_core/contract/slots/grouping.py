@@ -63,7 +63,8 @@ class Grouping(Component):
     Attributes:
         labels: Every label that the rule can give, near first; empty if the user's input defines
             the labels.
-        needs_probe: True if the rule reads gradients and cannot label views without a probe.
+        needs_probe: True if the rule reads gradients and cannot label views without a
+            `GradientProbe`.
     """
 
     slot: ClassVar[str] = "groupings"
@@ -87,7 +88,7 @@ class Grouping(Component):
         """
 
     def quantity(self, scene: Scene, views: Sequence[View]) -> Quantity | None:
-        """Return the quantity that the rule splits, so that a run can report a single mode.
+        """Return the quantity that the rule splits; a run reports if it has a single mode.
 
         Args:
             scene: The scene.

@@ -51,7 +51,7 @@ class Resolution(Component):
         return ()
 
     def pixels(self, schedule: Schedule, step: int) -> float:
-        """Return the pixels rendered in all steps up to and including this one, in full photos.
+        """Return the pixels that all steps up to this step render, in numbers of full photos.
 
         Time budgets use this number for planning. By default all views have their full size.
         """
