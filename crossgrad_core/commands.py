@@ -353,7 +353,7 @@ def resolved(setup: "Setup") -> dict[str, Any]:
 
 
 def available_cores() -> tuple[int, ...]:
-    """Return the cores that this process may use, limited by the quota of its container."""
+    """Return the number of cores that this process may use, limited by its container's quota."""
     import os
 
     from crossgrad_core.system import cores

@@ -317,7 +317,7 @@ class Scene:
     check: Mapping[str, Json] | None = None
 
     def with_points(self, rows: NDArray[np.int64]) -> "Scene":
-        """Return the scene with only the points in `rows` [Q] (ascending), and update `View.seen`."""
+        """Return the scene with only the points in `rows` [Q] (ascending); `seen` is updated."""
         new_rows = np.full(len(self.points), -1)
         new_rows[rows] = np.arange(len(rows))
 

@@ -27,7 +27,7 @@ def sigmoid(values: Tensor) -> Tensor:
 
 
 class _Sigmoid(torch.autograd.Function):
-    """`sigmoid_` with a gradient whose bits do not depend on the threads, even without blocks."""
+    """`sigmoid_` with a gradient, which has the same bits for any number of threads."""
 
     @staticmethod
     @override

@@ -13,11 +13,9 @@ than computing with one thread. Here, a helper thread that starts too late is sk
 threads sleep.
 
 A thread starts with its own range of jobs and continues with the remaining jobs of other threads.
-So in each kernel a thread reads the data that it wrote in the previous kernel, which its core still
-caches.
-
-The result of a job must not depend on the thread that runs it. Then the threads do not affect any
-bit.
+Therefore, a thread reads the data that it wrote in the previous kernel, and the cache of its core
+still contains this data. The result of a job must not depend on the thread that runs the job. Then
+the number of threads does not change any bit of the results.
 """
 # ruff: noqa: ANN401, ARG001 - Numba's objects have no types, and it fixes the arguments.
 
@@ -177,8 +175,8 @@ class _Call:
 class _Helpers:
     """The helper threads of a process, on other cores than the calling thread.
 
-    Linux starts a woken thread on the core of the waking thread and moves it later to an idle core.
-    This takes longer than most kernels.
+    When a thread wakes another thread, Linux starts the woken thread on the same core and moves it
+    to an idle core later. This takes longer than most kernels.
     """
 
     def __init__(self) -> None:
@@ -190,7 +188,7 @@ class _Helpers:
         atexit.register(self._dismiss)
 
     def ask(self, calls: Sequence[_Call]) -> None:
-        """Give one call to each of as many helper threads as there are calls."""
+        """Give each call to a helper thread of its own."""
         core = current_core()
         if core != self._core:
             self._core = core
@@ -228,6 +226,6 @@ def _helpers(process: int) -> _Helpers:
 
 
 def serial(kernel: Callable[Concatenate[Jobs, P], None], *args: P.args, **kwargs: P.kwargs) -> None:
-    """Run a kernel on this thread only, for little work; the bits are the same."""
+    """Run a kernel on this thread only, for little work; the result has the same bits."""
     (jobs,) = _jobs(1)
     kernel(jobs, *args, **kwargs)

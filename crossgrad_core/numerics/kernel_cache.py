@@ -1,4 +1,4 @@
-"""Disk cache of compiled kernels: files are named by all of their sources and checked before use.
+"""Disk cache of compiled kernels: a file's name depends on all sources of its kernel.
 
 One file contains one kernel for one signature: the SHA-256 of the remaining content, then the key
 and Numba's result. There is no index that two processes could overwrite. A file is written

@@ -75,7 +75,7 @@ def raised_at(error: BaseException, package: str) -> str:
 
 
 def defined_at(thing: object) -> str:
-    """Return the place of the definition of a class or function; empty without a source."""
+    """Return file and line of the definition of a class or function; empty without a source."""
     try:
         return f"{inspect.getsourcefile(thing)}:{inspect.getsourcelines(thing)[1]}"  # type: ignore[arg-type]
     except (TypeError, OSError):

@@ -1,4 +1,4 @@
-"""Runs from Python: the same as `crossgrad run`, but with exceptions instead of exit codes."""
+"""Runs from Python: like `crossgrad run`, but with exceptions instead of exit codes."""
 
 import signal
 from collections.abc import Iterator, Sequence

@@ -125,13 +125,13 @@ def table_of(config: RunConfig, scene: Scene, start: int | None = None) -> dict[
 
 
 def redecided(setup: Setup, planned: int, start: int | None = None) -> Setup:
-    """Return the run with the numbers and rules for its newly planned length.
+    """Return the run with numbers and rules decided again for its newly planned length.
 
-    Other components stay the same.
+    All other components stay the same.
 
     Args:
         setup: The run.
-        planned: Number of steps that the run is now planned with.
+        planned: New planned number of steps.
         start: Primitives at the start; None before they are counted.
     """
     numbers = {field.name for field in fields(Numbers)}

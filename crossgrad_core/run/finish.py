@@ -95,7 +95,7 @@ class RunLoop:
     """A run in progress.
 
     Attributes:
-        setup: The setup; a run that follows the clock replaces it.
+        setup: The setup; a run with a time budget replaces it.
         state: The state; after an exception, the last good state.
         session: The writer of the results.
         log: The run's log.txt.

@@ -86,7 +86,7 @@ NO_POINTS: Final = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8)
 
 
 def read_cloud(path: Path, source: str) -> PointCloud:
-    """Read positions and colours of a PLY, LAS or LAZ file; grey if it has no colours.
+    """Read positions and colours of a PLY, LAS or LAZ file; grey if the file has no colours.
 
     Raises:
         UserError: The file is not a point cloud, or laspy is missing for LAS and LAZ.

@@ -52,8 +52,8 @@ def split_views(
     """Split views by the option `split`; there is always at least one training view.
 
     `auto` uses lists or the given split first. If there are none, `auto` holds out each n-th photo
-    of each folder. If only a split by regime holds out two or more photos of some regime, it holds
-    out each n-th photo of each regime.
+    of each folder. If fewer than two photos of a regime would be held out, and a split by regime
+    would hold out two or more, `auto` holds out each n-th photo of each regime instead.
 
     Args:
         names: Names of all usable views.
@@ -195,7 +195,10 @@ def _read_lists(root: Path, names: Sequence[str]) -> tuple[frozenset[str], froze
 
 
 def _read_list(path: Path, views: Sequence[str]) -> frozenset[str] | None:
-    """Read the names in a list, with view names for names that match a view; None if missing."""
+    """Read the names in a list; a name that matches a view becomes the name of the view.
+
+    Return None if the list does not exist.
+    """
     if not path.is_file():
         return None
     try:

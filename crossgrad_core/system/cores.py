@@ -12,7 +12,7 @@ _CGROUP_LIMIT = Path("/sys/fs/cgroup/cpu.max")
 
 
 def available_cores() -> int:
-    """Return the cores of this process: its affinity, limited by the CPU quota rounded up."""
+    """Return the number of usable cores: the affinity, limited by the CPU quota rounded up."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return max(1, min(cores or 1, _quota(_CGROUP_LIMIT)))
 

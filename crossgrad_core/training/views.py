@@ -201,7 +201,7 @@ def add_regularization(
     gaussians: Gaussians | None = None,
     view: View | None = None,
 ) -> None:
-    """Add the gradients of all regularisation terms of one view or, if None, of the step."""
+    """Add the gradients of the regularisation terms of a view (None: of the whole step)."""
     context = RegularizeContext(
         **context_fields(setup, state, "regularize"),
         parameters=state.current,
@@ -444,7 +444,7 @@ def _render_jointly(
     scales: Sequence[float],
     regular: TensorGradients,
 ) -> tuple[Rendered, Gradients]:
-    """Run one backward pass through the sum of the losses (for comparison; all graphs alive)."""
+    """Run one backward pass through the summed losses, as a reference; all graphs stay alive."""
     _clear(state.tensors)
     drawn = [_draw_view(setup, state, draw, slot, scale) for slot, scale in enumerate(scales)]
     losses = [view.loss.detach() for view in drawn]

@@ -36,8 +36,8 @@ class Backbone(Component):
         positions: Name of the tensor [N, 3] of the primitives' positions in the local frame. Before
             the first step and after steps with edits, the primitives are sorted in memory by
             position: all rows of all per-primitive tensors are sorted together, and `prepare` is
-            not called. At the end of a run, floaters may be removed in the same way; to find
-            floaters, `decode` is called with some of the rows only. If the name is empty, only
+            not called. At the end of a run, the rows of floaters may be removed in the same way.
+            Before this, `decode` is called with some of the rows only. If the name is empty, only
             edits move or remove rows.
         axes: Names of two tensors, if each primitive is one Gaussian at its position: [N, 3]
             logarithms of standard deviations and [N, 4] rotations (wxyz, of any length). Positions

@@ -49,7 +49,7 @@ def white_of(deep: Sequence[Path]) -> tuple[int, list[str]]:
     dark if they use a small part of their range and do not fill the range of a smaller bit depth.
 
     Args:
-        deep: The photos. Photos are decoded until one photo is bright enough for 16 bits.
+        deep: The 16-bit photos. They are decoded until one photo is bright enough for 16 bits.
 
     Raises:
         UserError: A photo is damaged.

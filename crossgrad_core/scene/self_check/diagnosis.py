@@ -86,7 +86,7 @@ class Diagnosis:
 
 
 def scores(agreement: Agreement, *, tracked: bool) -> Floats:
-    """Return scores [V] in [0, 1]: colour correlation, for tracks times the share in frame."""
+    """Return scores [V] in [0, 1]: colour correlation, with tracks times the share in frame."""
     correlation = np.maximum(np.nan_to_num(agreement.correlation), 0.0)
     if tracked:
         return np.asarray(correlation * np.nan_to_num(agreement.share))
@@ -157,7 +157,7 @@ class Bench:
         return found
 
     def _searched(self, search: Search) -> tuple[float, Trial]:
-        """Search the best numbers: first the given values, then with halved steps around it."""
+        """Search the best numbers: try the given values, then refine the best with halved steps."""
         tried = [self.tried(search.trial(value)) for value in search.values]
         best, score, step = search.values[int(np.argmax(tried))], max(tried), search.step
         for _ in range(_ROUNDS):

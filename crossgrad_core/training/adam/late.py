@@ -5,8 +5,8 @@ steps are applied row by row when the row is next rendered, or to all rows when 
 The deferred steps use the same float32 operations in the same order, so the bits are the same as
 without deferral.
 
-Steps run in the background on other threads while this thread continues with serial work. The
-tensor is not read before it is rendered or requested; a reader then waits for the step.
+Steps run in the background on other threads while this thread continues with serial work. Code that
+reads the tensor, for a render or on request, waits until the step is complete.
 """
 
 from dataclasses import dataclass, field
