@@ -331,7 +331,7 @@ def assemble_new(config: "RunConfig", scene: "Scene", reader: str) -> "Setup":
     """Assemble a run like `assemble`, but also refuse settings and labels that have no effect.
 
     Raises:
-        UserError: For the reasons of `assemble`, or because a setting would change nothing.
+        UserError: A setting would change nothing; see also `assemble`.
     """
     from crossgrad_core.recipe import table
     from crossgrad_core.run import assemble as assembling

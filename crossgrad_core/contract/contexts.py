@@ -55,7 +55,7 @@ class RenderedView:
         scale: Side length of the render divided by the side length of the photo as trained.
         gaussians: The Gaussians that were rendered.
         screen: Screen statistics in pixels of the render, with gradients if a backward pass has
-            run. `contract.screen_statistics` converts them to units of the full photo.
+            run. `contract.screen_statistics` converts the statistics to units of the full photo.
         image: [H, W, 3] the image that is compared with the photo: the render after exposure.
         photo: [H, W, 3] uint8 photo, in the size of the render.
         mask: [H, W] bool, True where the pixel counts; None if every pixel counts.

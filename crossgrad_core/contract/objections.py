@@ -100,7 +100,7 @@ def unused_options(component: Component, selection: Selection) -> Mapping[str, s
 
 
 def set_for_nothing(component: Component, selection: Selection) -> dict[str, str]:
-    """Return the unused options that were set to a value other than their default."""
+    """Return the unused options whose values are not their defaults."""
     fields = type(component).model_fields
     return {
         name: why

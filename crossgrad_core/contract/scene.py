@@ -424,7 +424,7 @@ def footprint(camera: Camera, points: NDArray[np.float64], seen: NDArray[np.int6
     """Return the median of f / z [pixels per local unit] over a camera's observed SfM points.
 
     If the camera observed fewer than 3 points in front of it, all points in its image are used
-    instead; the result is NaN without any point.
+    instead. If there are no such points either, the result is NaN.
 
     Args:
         camera: The camera, in the size of the photo as trained.

@@ -60,7 +60,7 @@ ONE_BY_ONE: Final = ViewsPerStep()
 
 @dataclass(frozen=True)
 class ViewsPerStepSpec:
-    """K over a run of any length: one number, or several numbers with the shares of their start.
+    """K over a run of any length: one number, or several numbers that start at given shares.
 
     Attributes:
         counts: The values of K.
@@ -155,7 +155,7 @@ def is_published(mode: ScheduleMode, reference: int | None) -> bool:
 
 @dataclass(frozen=True)
 class Counting:
-    """The unit in which a schedule counts, and the quantities that the unit requires.
+    """The unit in which a schedule counts, and properties of the run that affect the schedule.
 
     Attributes:
         unit: The unit of the schedule's numbers, views or steps.
@@ -393,8 +393,8 @@ class Schedule:
     def prunes_large(self, step: int) -> bool:
         """Return True if an edit after this step removes primitives that are large in world space.
 
-        This is the case after the first opacity reset, as published, and never in runs without
-        resets.
+        As published, edits remove large primitives after the first opacity reset, and never in runs
+        without resets.
         """
         return self.reset_every is not None and self.counted(step - 1) >= self.reset_every
 
@@ -467,8 +467,8 @@ class Phase:
 def shortness(views: float) -> float:
     """Return 1 for runs of up to `SHORT` views, 0 from the published length on.
 
-    In between, the value falls with the logarithm of the length. Settings that suit only short runs
-    lose their effect gradually with this value.
+    In between, the value falls with the logarithm of the length. Settings for short runs lose their
+    effect gradually as this value falls.
     """
     short = log(REFERENCE / max(1.0, views)) / log(REFERENCE / SHORT)
     return min(1.0, max(0.0, short))

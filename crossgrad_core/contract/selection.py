@@ -23,7 +23,7 @@ from crossgrad_core.contract.slots.sampler import Sampler
 
 @dataclass(frozen=True)
 class Selection:
-    """The chosen components of a run, for the check of their combination.
+    """The chosen components of a run, for checking whether the components work together.
 
     Attributes:
         backbone: The backbone.

@@ -1,7 +1,7 @@
 """The running sum of the gradients of K views on a GPU; the host waits only when the sum is read.
 
-`SummedGradients` checks the gradients of each view when they are added. On a GPU, this would make
-the host wait K times for each tensor.
+`SummedGradients` checks the gradients of each view when they are added. On a GPU, these checks
+would make the host wait K times for each tensor.
 """
 
 from collections.abc import Mapping, Sequence

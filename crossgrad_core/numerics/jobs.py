@@ -59,7 +59,7 @@ def next_job(jobs: Jobs, count: int) -> int:
     """Return the number of a free job, or `count` if no job is left; only for use in kernels.
 
     Args:
-        jobs: From `parallel` or `serial`.
+        jobs: Job counters, passed by `parallel` or `serial`.
         count: Number of jobs, the same in every call of a kernel.
     """
     threads = jobs[0]
@@ -94,8 +94,8 @@ def parallel(
 class Begun:
     """A kernel that runs on the other threads while the calling thread does other work.
 
-    No other code may use the data of the kernel until `end`. With one thread, the kernel runs to
-    its end immediately.
+    No other code may use the data of the kernel until `end` returns. With one thread, the kernel
+    runs to its end immediately.
 
     Args:
         kernel: The kernel, as for `parallel`; its arguments follow.
@@ -166,7 +166,7 @@ class _Call:
                 self.error = error
 
     def end(self) -> None:
-        """Return when the call has finished or is cancelled; this may be called repeatedly."""
+        """Return when the call has finished or is cancelled; `end` may be called repeatedly."""
         self._needed = False
         with self._under_way:
             pass

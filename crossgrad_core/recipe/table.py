@@ -98,7 +98,7 @@ def applied(config: RunConfig, rows: Sequence[Decision], planner: str = "") -> R
         planner: Name of the planner that made the rows; empty if the recipe made them.
 
     Raises:
-        UserError: A row names a setting that does not exist, or gives it a wrong value.
+        UserError: A row names a setting that does not exist, or gives a setting a wrong value.
     """
     update: dict[str, Any] = {RULES: {}, **config.model_dump(exclude_unset=True)}
     for row in sorted(rows, key=lambda row: "." in row.setting):

@@ -130,8 +130,8 @@ def load(slot: "str | type[Component]", name: str) -> "type[Component]":
         name: Name of the plugin.
 
     Raises:
-        UserError: The name is unknown or ambiguous, the plugin fails to import, or its object is
-            not a complete subclass of the slot's base class, or its methods take other arguments.
+        UserError: The name is unknown or ambiguous; the plugin fails to import; the plugin is not a
+            complete subclass of the slot's base class; or its methods take other arguments.
     """
     return load_entry(find(slot if isinstance(slot, str) else slot.slot, name))
 
@@ -249,7 +249,7 @@ def build(slot: "str | type[Component]", name: str, options: Mapping[str, Any]) 
         options: Name of an option -> value.
 
     Raises:
-        UserError: For the reasons of `load`, or an option is unknown, missing or out of bounds.
+        UserError: An option is unknown, missing or out of bounds; see also `load`.
     """
     from pydantic import ValidationError
 

@@ -105,7 +105,7 @@ def read_and_check(config: RunConfig, path: Path, *, accept: bool = False) -> tu
             set this.
 
     Raises:
-        UserError: For the reasons of `read_scene`, or because the scene contradicts itself.
+        UserError: The scene contradicts itself; see also `read_scene`.
     """
     scene, name = read_scene(config, path)
     data = config.data

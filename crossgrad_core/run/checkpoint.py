@@ -475,7 +475,7 @@ def latest(run: Path) -> Path:
 
 
 def drop_later(run: Path, step: int) -> None:
-    """Delete checkpoints after `step`, because a run resumed there would not reproduce them."""
+    """Delete checkpoints after `step`, because a run resumed at `step` would not reproduce them."""
     for later, folder in named_checkpoints(run / CHECKPOINTS).items():
         if later > step:
             discard(folder)

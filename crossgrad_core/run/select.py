@@ -155,7 +155,7 @@ def _require_decided_options(config: RunConfig, name: str) -> None:
 
 
 def fitted_backbone(config: RunConfig, scene: Scene) -> tuple[Backbone, tuple[str, ...]]:
-    """Return the backbone of a run, fitted to its scene, and notes on what was left out."""
+    """Return the backbone of a run, fitted to its scene, and notes on the fitted options."""
     backbone = chosen(Backbone, config.backbone)
     return pair(backbone.fitted_to(scene), Backbone, tuple, backbone, "fitted_to")
 

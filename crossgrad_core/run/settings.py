@@ -112,7 +112,7 @@ def layered(layers: Sequence[Mapping[str, object]], assignments: Sequence[str] =
 
 
 def with_recipe(settings: Mapping[str, Any]) -> Settings:
-    """Return the settings with the settings that their recipe fixes, unless they are given.
+    """Return the settings, with the values that their recipe fixes for settings that are open.
 
     A configuration that a run wrote already contains the fixed settings.
 
@@ -424,7 +424,7 @@ def _renamed(old: object, new: object) -> object:
 
 
 def _with_options(old: list[Settings], new: Settings) -> Settings:
-    """Return the new choice with the options of an old choice that has the same name or none."""
+    """Return the new choice, with the options of an old choice of the same name or of no name."""
     for link in old:
         if link.get("name", new["name"]) == new["name"]:
             return {**link, **new}

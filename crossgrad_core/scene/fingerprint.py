@@ -1,6 +1,6 @@
 """The fingerprint of a scene, and how two fingerprints differ.
 
-A fingerprint holds the frame, cameras, split, points, and the digests of the scene's files.
+A fingerprint contains the frame, cameras, split, points, and the digests of the scene's files.
 """
 
 import os

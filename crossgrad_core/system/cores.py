@@ -30,7 +30,7 @@ def let_idle_threads_sleep() -> None:
     """Let torch's idle threads sleep, unless the environment already sets a policy.
 
     OpenMP threads otherwise spin for milliseconds on cores that other threads and programs need.
-    This has an effect only before torch is imported.
+    The call has an effect only before torch is imported.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 

@@ -159,7 +159,7 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
 
 
 def most_steps(setup: Setup) -> int:
-    """Return the largest number of steps of a run with a time budget, however fast they are."""
+    """Return the largest number of steps of a run with a time budget, even if steps are fast."""
     views = setup.config.max_views
     return _NEVER if views is None else setup.selection.views.steps_of(views)
 

@@ -154,7 +154,7 @@ class Prefetcher:
         setup.photos_ahead.expect(wanted)
 
     def _follow(self, state: TrainState) -> None:
-        """Drop the prediction of the last step, and all predictions if this one was wrong."""
+        """Drop the prediction of the last step; if it was wrong, drop all predictions."""
         if self._draws and self._step - len(self._draws) == state.step - 1:
             drawn = self._draws.popleft()
             if state.last is not None and state.last.views == drawn:

@@ -17,7 +17,7 @@ RESTED: Final = 0.5
 
 
 def axes_of(setup: Setup) -> tuple[str, str, str] | None:
-    """Return the tensors of positions, scales and rotations if positions step along axes."""
+    """Return names of the tensors of positions, scales and rotations for steps along axes."""
     return setup.backbone.gaussian_tensors if setup.numbers.position_lr == "per-axis" else None
 
 

@@ -95,7 +95,7 @@ class PhaseTimer:
         total: Seconds from the start of the step to the end of the previous phase, without excluded
             seconds.
         spent: Phase -> seconds.
-        cpu: CPU seconds of the process in the same time, without excluded seconds.
+        cpu: CPU seconds of the process during `total`, without excluded CPU seconds.
         cpu_border: CPU time of the process at the end of the previous phase.
     """
 
@@ -117,7 +117,7 @@ class PhaseTimer:
         self.cpu_border = cpu
 
     def leave_out(self, seconds: float, cpu: float) -> None:
-        """Exclude seconds from the present phase, because they belong to another clock.
+        """Exclude seconds from the present phase, because these seconds belong to another clock.
 
         Args:
             seconds: Wall-clock seconds.
@@ -372,7 +372,7 @@ class StepSnapshot:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """A copy of the last good state, to go back to."""
+    """A copy of the last good state, for a rollback."""
 
     parameters: Parameters
     adam: AdamState

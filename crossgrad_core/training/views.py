@@ -425,7 +425,7 @@ def _pass_back(decoded: Gaussians, copy: Gaussians) -> None:
 def _with_losses(
     state: TrainState, records: Sequence[ViewRecord], losses: Sequence[Tensor]
 ) -> tuple[ViewRecord, ...]:
-    """Return the records with their losses, which are read together so that the host waits once.
+    """Return the records with their losses; the host reads all losses at once and waits once.
 
     Raises:
         NonFiniteError: A loss is not finite.
@@ -523,7 +523,7 @@ def _compare(
 
 
 def _seen(setup: Setup, state: TrainState, camera: Camera) -> Gaussians:
-    """Return the decoded Gaussians of a view; some tensors are updated when they are rendered."""
+    """Return the decoded Gaussians of a view; some rows are updated only when they are rendered."""
     phase = setup.phase(state.step, training=True)
     tensors = _learning(setup, state)
     answer = setup.backbone.decode(tensors, camera, phase)

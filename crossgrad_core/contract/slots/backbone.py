@@ -99,7 +99,7 @@ class Backbone(Component):
         return names is not None and any(names[1] in block.tensors for block in learning)
 
     def fitted_to(self, scene: Scene) -> tuple["Backbone", tuple[str, ...]]:
-        """Return this backbone without options that the scene does not need, and notes about them.
+        """Return this backbone without options that the scene does not need, and notes on it.
 
         Options that the user set are never changed.
         """
@@ -122,8 +122,9 @@ class Backbone(Component):
     def prepare(self, parameters: Parameters, scene: Scene, phase: Phase) -> Parameters:
         """Return the parameters with derived tensors updated.
 
-        This is called before the first step and after every topology edit. A backbone that stores
-        derived tensors without gradient (filters, levels) computes them again in this method.
+        This method is called before the first step and after every topology edit. A backbone that
+        stores derived tensors without gradient (filters, levels) computes them again in this
+        method.
         """
         return parameters
 

@@ -18,8 +18,8 @@ class PerPhoto:
 
     Attributes:
         start: [P, ...] float32, the initial values in the order of `scene.train_views`; or a
-            function that computes them, if this takes long. A resumed run does not call this
-            function.
+            function that computes the values, if the computation takes long. A resumed run does not
+            call this function.
         lr: Learning rate of the parameter.
     """
 
@@ -66,7 +66,7 @@ class Exposure(Component):
         return Fitted(self)
 
     def messages(self, scene: Scene, known: Mapping[str, Tensor]) -> tuple[str, ...]:
-        """Return messages about this exposure and the scene; this is called for new runs only.
+        """Return messages about this exposure and the scene; called for new runs only.
 
         `known` contains the initial values [P, ...] by name if the user gives a file; else it is
         empty.
@@ -107,8 +107,8 @@ class Exposure(Component):
     ) -> Mapping[str, Tensor]:
         """Return the values of a view that is not used for training, without reading its pixels.
 
-        By default this is the mean over the training photos of its regime, or over all training
-        photos if its regime contains none.
+        By default, each value is the mean over the training photos of the view's regime, or over
+        all training photos if the regime contains none.
 
         Args:
             view: The view.

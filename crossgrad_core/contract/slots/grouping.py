@@ -18,7 +18,7 @@ class GroupingRule:
     """A grouping after its fit to the training cameras of a scene.
 
     Attributes:
-        labels: One label per view, for any views of the scene, in their order.
+        labels: Function from views of the scene to their labels, one per view, in the same order.
         notes: Messages for the user about the fitted rule (its threshold, a fall-back ...).
     """
 

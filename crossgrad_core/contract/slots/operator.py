@@ -20,7 +20,7 @@ class Operator(Component):
 
     Attributes:
         separate: True if the operator needs the separate gradients of the views. Otherwise the
-            backward passes accumulate into one gradient, with the same bits and without copies.
+            backward passes accumulate one gradient, which has the same bits and needs no copies.
         views: Supported values of K.
         identity_at_one: True if the operator returns the gradient of a single view unchanged. A run
             with K = 1 then reports that the operator does nothing.

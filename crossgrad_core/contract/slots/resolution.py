@@ -47,7 +47,7 @@ class Resolution(Component):
         return self
 
     def messages(self, schedule: Schedule) -> tuple[str, ...]:
-        """Return messages about the scales under this schedule; called again when it changes."""
+        """Return messages about the scales under this schedule; called again for a new schedule."""
         return ()
 
     def pixels(self, schedule: Schedule, step: int) -> float:

@@ -135,7 +135,7 @@ def gramians(jobs: Jobs, addresses: Ints, sizes: Ints, table: Ints, partial: Flo
     """Write the Gramian of each chunk in one pass; NaN or infinite if a view is not finite.
 
     Args:
-        jobs: From `parallel` or `serial`.
+        jobs: Job counters, passed by `parallel` or `serial`.
         addresses: [T, K].
         sizes: [T].
         table: [C, 2] from `chunk_table`.
@@ -176,7 +176,7 @@ def spread_gramian(
     """Write the Gramians of gradients that are zero except in some rows, bit-equal to `gramians`.
 
     Args:
-        jobs: From `parallel`.
+        jobs: Job counters, passed by `parallel`.
         addresses: [K] addresses of the values [R * width]; 0 if a view does not touch the tensor.
         rows: [R], sorted.
         width: Elements of a row.
@@ -298,7 +298,7 @@ def _combine_pieces(
     first: int,
     end: int,
 ) -> None:
-    """Compute results in a buffer in fast memory, because they may overwrite one of the rows."""
+    """Compute results in a buffer in fast memory, because the results may overwrite a row."""
     wide = np.empty(PIECE)
     narrow = np.empty(PIECE, np.float32)
     for start in range(first, end, PIECE):
@@ -355,7 +355,7 @@ def combine(
     """Write the weighted sums of all tensors, in one pass over all views.
 
     Args:
-        jobs: From `parallel` or `serial`.
+        jobs: Job counters, passed by `parallel` or `serial`.
         addresses: [T, K]; 0 leaves the view out.
         weights: [T, K].
         plain: [T], True to add the rows in float32 in the order of the views instead.

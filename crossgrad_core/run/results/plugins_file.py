@@ -91,7 +91,7 @@ def with_present(known: Packages | None, present: Packages) -> Packages:
 
 
 def history(packages: Packages) -> tuple[str, ...]:
-    """Return a note on each package of which several versions trained the run."""
+    """Return a note on each package if several versions of it trained the run."""
     return tuple(
         (
             f"trained with {name} {', then '.join(package.versions)} "

@@ -46,7 +46,7 @@ class PhotoSource:
     Attributes:
         path: The photo.
         width: Width of the photo in the pixels that its pose refers to.
-        height: Height of the photo in the same pixels.
+        height: Height of the photo in the pixels that its pose refers to.
         orientation: The EXIF orientation that its pose refers to; 1 for the stored pixel grid.
         mask: The mask file, or None.
         alpha: True if the file may have transparent pixels.

@@ -221,7 +221,7 @@ def other_axes() -> Iterator[Trial]:
 
 
 def searches() -> Iterator[Search]:
-    """Yield changes with numbers: factors by their logarithm, then shares of width and height."""
+    """Yield changes with numbers: logarithms of factors, then shares of width and height."""
     for make, most in ((_focal, 5.0), (_scaled, 100.0), (_resized, 10.0)):
         steps = np.arange(-np.log(most), np.log(most), _FACTOR)
         yield Search(steps[:, None], _FACTOR, _by_logarithm(make))

@@ -149,7 +149,7 @@ class _Group:
         evidence: The points for the comparison.
         views: [V] rows of the views.
         agreement: Agreement of the unchanged photos.
-        recolored: True if the points' own colours are useless, so that the photos' colours replace
+        recolored: True if the points' own colours are useless; the photos' colours then replace
             them.
     """
 
@@ -351,7 +351,7 @@ class _Group:
 
     @property
     def _fitting(self) -> float:
-        """The least score of a photo that fits."""
+        """The lowest score at which a photo counts as fitting."""
         return max(_FITS * self.better, LEAST)
 
     def _fitting_others(self, rows: Integers, candidates: Integers) -> Integers:

@@ -86,7 +86,7 @@ class Late:
         return frozenset(self._behind).union(self._under_way)
 
     def finish(self, name: str | None = None) -> None:
-        """Wait until no step is running; deferred steps are still deferred afterwards.
+        """Wait until no step is running; deferred steps remain deferred.
 
         Args:
             name: The tensor; None means all tensors.
@@ -153,8 +153,7 @@ class Late:
             name: Name of the tensor.
             param: The tensor.
             adam: Moments and counts.
-            rows: [R] int32 without duplicates; None means all rows, after which no step is
-                deferred.
+            rows: [R] int32 without duplicates; None means all rows; then no step remains deferred.
         """
         self.finish(name)
         behind = self._behind.get(name)

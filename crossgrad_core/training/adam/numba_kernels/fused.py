@@ -69,7 +69,7 @@ def _update_chunks(
     """Update all tensors, chunk by chunk.
 
     Args:
-        jobs: From `parallel`.
+        jobs: Job counters, passed by `parallel`.
         addresses: [T, 4] addresses of each tensor's values, gradient and moments.
         sizes: [T] numbers of elements.
         numbers: [T, 9] coefficients of each tensor's step.

@@ -131,7 +131,7 @@ def catch_up(
     """Apply the deferred steps without gradient to rows of a tensor.
 
     Args:
-        jobs: From `parallel`.
+        jobs: Job counters, passed by `parallel`.
         whole: True to update all rows.
         rows: [R] the rows to update, without duplicates; unused if `whole`.
         width: Elements of a row.
@@ -256,7 +256,7 @@ def update_rows(
     """Apply one step to rows of a tensor with their gradients.
 
     Args:
-        jobs: From `parallel`.
+        jobs: Job counters, passed by `parallel`.
         rows: [R], sorted and unique; consecutive rows are updated as one piece of memory.
         width: Elements of a row.
         param: [N * width].
@@ -314,7 +314,7 @@ def update_all(
     """Apply one step to all rows of a tensor; rows that are not listed have no gradient.
 
     Args:
-        jobs: From `parallel`.
+        jobs: Job counters, passed by `parallel`.
         rows: [R], sorted and unique.
         width: Elements of a row.
         param: [N * width].
