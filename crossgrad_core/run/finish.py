@@ -43,7 +43,7 @@ def reason_of(error: BaseException) -> str:
 
 
 def is_unexpected(error: BaseException) -> bool:
-    """Return True if crossgrad did not write the error's message for its users."""
+    """Return True if crossgrad did not write the message of the error for users."""
     return not isinstance(error, UserError | TrainingFailedError)
 
 

@@ -350,7 +350,7 @@ def set_up(
     *,
     looks: bool = False,
 ) -> tuple[Setup, float]:
-    """Return the assembled run, and the seconds of reading the scene and of assembling.
+    """Return the assembled run, and the seconds that reading the scene and assembling took.
 
     Args:
         config: The configuration, with a scene.

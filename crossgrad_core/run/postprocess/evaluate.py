@@ -122,7 +122,7 @@ def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, To
     """Evaluate the held-out views of a run again, and rewrite per_view.csv.
 
     The results get another file name if the scene has changed, or if summary.json describes another
-    step. The folder is only read if the run is training, if the folder is not writable, or if
+    step. Nothing is written if the run is training, if the folder is not writable, or if
     per_view.csv has values that cannot be measured here.
 
     Raises:

@@ -81,7 +81,7 @@ class Diagnosis:
 
     @property
     def repairs(self) -> bool:
-        """True if the change makes photos agree that did not agree before."""
+        """True if the photos agree after the change and did not agree before."""
         return self.after >= LEAST and self.after >= self.before + GAINED
 
 
