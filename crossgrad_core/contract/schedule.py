@@ -407,7 +407,7 @@ class Schedule:
 
 
 def _with_edits_ahead(schedule: Schedule, wanted: Schedule, step: int) -> Schedule:
-    """Return the schedule with its edits after the end of `step` replaced by the edits of `wanted`."""
+    """Return the schedule with the edits of `wanted` in place of all edits after `step`."""
     now = schedule.counted(step)
     done = schedule.edits_before + schedule.edits() - schedule.edits(step)
     missing = max(0, schedule.min_refinements - done)

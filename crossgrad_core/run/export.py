@@ -51,7 +51,7 @@ class Exported:
 
     @property
     def loss(self) -> float | None:
-        """The loss of PSNR in dB, by baking and by the background; no file stores the background."""
+        """The loss of PSNR in dB by baking and by the background, which no file stores."""
         if self.psnr is None or self.live_psnr is None:
             return None
         return self.live_psnr - self.psnr

@@ -53,7 +53,7 @@ class GradientProbe(Protocol):
         ...
 
     def gramians(self, views: Sequence[int]) -> NDArray[np.float64]:
-        """Return [B, V, V] float64 Gramians of the gradients of V training views, given by index."""
+        """Return [B, V, V] float64 Gramians of the gradients of these V training views."""
         ...
 
 
