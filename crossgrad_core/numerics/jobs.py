@@ -1,16 +1,16 @@
 """Dynamic distribution of jobs over threads: each thread takes the next job when it is idle.
 
-A kernel takes jobs until none is left,
+A kernel takes jobs until none is left:
 
     job = next_job(jobs, count)
     while job < count:
         ...
         job = next_job(jobs, count)
 
-and `parallel` calls the kernel on all threads at once. Numba's own `prange` divides the work into
-equal parts in advance and waits for every thread. If a core is busy or slow, waiting takes longer
-than computing with one thread. Here, a helper thread that starts too late is skipped, and idle
-threads sleep.
+`parallel` calls the kernel on all threads at once. Numba's own `prange` divides the work into equal
+parts in advance and waits for every thread. If a core is busy or slow, waiting takes longer than
+computing with one thread. Here, a helper thread that starts too late is skipped, and idle threads
+sleep.
 
 A thread starts with its own range of jobs and continues with the remaining jobs of other threads.
 Therefore, a thread reads the data that it wrote in the previous kernel, and the cache of its core

@@ -337,7 +337,7 @@ def _tell_held_back(setup: Setup, record: StepRecord) -> None:
 
 
 def looks_after(setup: Setup, step: int) -> bool:
-    """Return True if all parameters are checked after this step, such as before a checkpoint."""
+    """Return True if all parameters are checked after this step, as before a checkpoint."""
     return step % CHECK_EVERY == 0 or saves_after(setup, step) or evaluates_after(setup, step)
 
 

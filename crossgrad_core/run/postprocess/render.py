@@ -35,7 +35,7 @@ def render(
     how: Opens = AS_IT_IS,
     on: Path | None = None,
 ) -> None:
-    """Render photo, render and error of the views of a run, or of another capture of its place.
+    """Draw photo, render and error of views of a run, or of another capture of its place.
 
     Args:
         folder: The run's folder.
