@@ -36,7 +36,7 @@ class Elsewhere:
 
     Attributes:
         name: Name of the capture.
-        views: The views without the views that the run was trained on.
+        views: The views of the capture, except the views that the run was trained on.
         points: [P, 3] the SfM points of the capture.
         trained: Number of views of the capture that the run was trained on.
         alike: True if the points are near the run's points, or if this is unknown.

@@ -192,7 +192,7 @@ def _require_laspy(path: Path) -> None:
 
 
 def thinned(points: CheckedPoints, most: int) -> tuple[CheckedPoints, list[str]]:
-    """Keep at most `most` of the points, one from each cube of a grid, and return them and a note.
+    """Return at most `most` of the points, one from each cube of a grid, and a note.
 
     The first point of each cube in file order is kept, so that equal input gives equal points.
     """

@@ -30,9 +30,9 @@ class Backbone(Component):
             standard PLY loses nothing.
         sets_dilation: True if the backbone's Gaussians set their own dilation, regardless of the
             rasterizer's dilation.
-        passthrough: Field of the Gaussians -> tensor that `decode` returns unchanged as this field
-            (or omits) and does not read. Then only the rendered rows need to be up to date.
-            Subclasses do not inherit this value.
+        passthrough: Field of the Gaussians -> tensor. `decode` returns the tensor unchanged as this
+            field, or omits the field, and never reads the tensor. Therefore only the rendered rows
+            of the tensor need to be up to date. Subclasses do not inherit this value.
         positions: Name of the tensor [N, 3] of the primitives' positions in the local frame. Before
             the first step and after steps with edits, the primitives are sorted in memory by
             position: all rows of all per-primitive tensors are sorted together, and `prepare` is

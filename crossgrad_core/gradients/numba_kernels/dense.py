@@ -152,7 +152,7 @@ def gramians(jobs: Jobs, addresses: Ints, sizes: Ints, table: Ints, partial: Flo
 
 @strict_device
 def _spread(addresses: Ints, rows: Ints, width: int, start: int, length: int, dense: Rows) -> bool:
-    """Fill `dense` [K * CHUNK] with one chunk of each view; return False if no row is in it."""
+    """Fill `dense` [K * CHUNK] with one chunk of each view; return False if it has no row."""
     first = np.searchsorted(rows, start // width)
     end = np.searchsorted(rows, (start + length - 1) // width + 1)
     if first == end:
