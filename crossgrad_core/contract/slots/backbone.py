@@ -22,9 +22,8 @@ class Backbone(Component):
     """A trained representation: parameters in named blocks, decoded to Gaussians for a camera.
 
     Attributes:
-        default_densifier: Name of the densifier that is used unless the user names another. In
-            short runs of many photos, another densifier replaces the densifier of the published
-            Gaussians.
+        default_densifier: Name of the densifier that is used unless the user names another. A
+            recipe may choose another densifier, for example in short runs of many photos.
         response: How the Gaussians of the backbone fill a pixel.
         plain: True if the backbone decodes to the same plain Gaussians for every camera, so that a
             standard PLY loses nothing.
