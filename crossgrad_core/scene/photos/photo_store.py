@@ -93,7 +93,7 @@ class PhotoStore:
         self._open = mib > 0
 
     def holds(self, source: Storable) -> bool | None:
-        """Return True if a file for this photo exists, valid or not; None if no photo is cached."""
+        """Return True if this photo has a file, valid or not; None if the photo is never cached."""
         origin = source.origin if self._open else None
         return None if origin is None else self._path(origin).is_file()
 
