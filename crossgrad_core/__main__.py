@@ -5,7 +5,7 @@ from crossgrad_core.system.interrupts import ended_quietly
 
 
 def main() -> None:
-    """Run the command line; an interrupt is handled before anything large is imported."""
+    """Run the command line; interrupts are also handled while large modules are imported."""
     let_idle_threads_sleep()
     with ended_quietly():
         from crossgrad_core.cli.main import main as command

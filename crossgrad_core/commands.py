@@ -275,9 +275,9 @@ def configured(settings: Mapping[str, Any]) -> "RunConfig":
 
 
 def chosen(config: "RunConfig") -> "list[tuple[str, ComponentChoice]]":
-    """Return the slot and the choice of each component that a configuration names.
+    """Return pairs of slot and component choice for the components that a configuration names.
 
-    A chain of operators gives one entry for each of its links.
+    A chain of operators gives one pair for each operator in the chain.
     """
     from crossgrad_core.config import AUTO, ComponentChoice
 
@@ -310,7 +310,7 @@ def fingerprint(scene: "Scene", config: "RunConfig") -> str:
 def read_scene(config: "RunConfig") -> "tuple[Scene, str]":
     """Return the checked scene of a configuration, and the name of the reader that read it.
 
-    The number of CPU threads is set first.
+    This function sets the number of CPU threads first.
 
     Raises:
         UserError: No reader accepts the folder, the reader cannot read it, or the scene contradicts
@@ -331,7 +331,7 @@ def assemble_new(config: "RunConfig", scene: "Scene", reader: str) -> "Setup":
     """Assemble a run like `assemble`, but also refuse settings and labels that have no effect.
 
     Raises:
-        UserError: For the reasons of `assemble`, or because a setting would change nothing.
+        UserError: A setting would change nothing; see also `assemble`.
     """
     from crossgrad_core.recipe import table
     from crossgrad_core.run import assemble as assembling
@@ -353,7 +353,7 @@ def resolved(setup: "Setup") -> dict[str, Any]:
 
 
 def available_cores() -> tuple[int, ...]:
-    """Return the cores that this process may use, limited by the quota of its container."""
+    """Return the number of cores that this process may use, limited by its container's quota."""
     import os
 
     from crossgrad_core.system import cores
@@ -388,7 +388,7 @@ def summary_of(folder: Path) -> dict[str, Any] | None:
 
 
 def with_steps(setup: "Setup", steps: int) -> "Setup":
-    """Return the run with the published schedule stretched to `steps`, for any components."""
+    """Return the setup with a schedule of `steps` steps that no component has changed."""
     from crossgrad_core.contract.schedule import Schedule
 
     counting = setup.schedule.counting
@@ -398,7 +398,7 @@ def with_steps(setup: "Setup", steps: int) -> "Setup":
 def affordable_steps(setup: "Setup", seconds: float) -> int:
     """Return how many steps fit into `seconds` of training.
 
-    The kernels are compiled first; the time for compiling does not count.
+    The kernels are compiled first. The compilation time is not part of `seconds`.
 
     Raises:
         TrainingFailedError: The trial steps failed.

@@ -32,7 +32,7 @@ _RENAMED: Final = {"views": "views_per_step"}
 
 
 def current_name(setting: str, beside: Container[str] = ()) -> str:
-    """Return the present name of a setting; keep the old name if `beside` contains the new one."""
+    """Return the present name of a setting; keep the old name if `beside` has the present name."""
     new = _RENAMED.get(setting, setting)
     return setting if new in beside else new
 
@@ -53,7 +53,7 @@ class ComponentChoice(BaseModel):
 
     @property
     def options(self) -> dict[str, Any]:
-        """The options as given."""
+        """The options that were given with the name; the component validates them later."""
         return dict(self.model_extra or {})
 
 
@@ -388,7 +388,7 @@ class RunConfig(BaseModel):
 
     @property
     def view_plan(self) -> ViewsPerStepSpec | None:
-        """Views per step over the run; None if the sampler decides."""
+        """The number of views of every step; None if the sampler decides it."""
         return (
             None
             if self.views_per_step is None
@@ -397,7 +397,7 @@ class RunConfig(BaseModel):
 
     @property
     def used_rules(self) -> tuple[ComponentChoice, ...]:
-        """The rules that are not left out."""
+        """The rules that the run uses; rules that were set to false are left out."""
         return tuple(
             ComponentChoice.model_validate({**options, "name": name})
             for name, options in self.rules.items()
@@ -406,5 +406,5 @@ class RunConfig(BaseModel):
 
     @property
     def operators(self) -> tuple[ComponentChoice, ...]:
-        """The operators of the chain; a single element without a chain."""
+        """The operators of the chain; if there is no chain, the only operator."""
         return self.operator if isinstance(self.operator, tuple) else (self.operator,)

@@ -33,7 +33,7 @@ INTERRUPTED = 130
 class WithPlugins(TyperGroup):
     """The core's commands, followed by the commands of installed plugins.
 
-    Other packages are searched only if the core does not have the command. A plugin cannot replace
+    Plugin packages are searched only if the core does not have the command. A plugin cannot replace
     a command of the core.
     """
 
@@ -68,7 +68,7 @@ class WithPlugins(TyperGroup):
 
 
 def _plain(error: typer.BadParameter) -> str:
-    """Return the problem with a value and the value, without the terms of the library."""
+    """Return the message about a wrong value, without pydantic's wording; the value is included."""
     from pydantic import ValidationError
 
     message = error.message.removeprefix("Value error, ").replace("Input should be", "must be")
@@ -90,7 +90,7 @@ class PluginCommand(TyperCommand):
     def make_context(
         self, info_name: str | None, args: list[str], parent: "Context | None" = None, **extra: Any
     ) -> "Context":
-        """Return the context of the plugin's command, which is imported first.
+        """Import the plugin's command and return the context of the command.
 
         Raises:
             UserError: Several packages offer the name, or the command cannot be imported.
@@ -143,7 +143,7 @@ app.command("export", cls=GroupedCommand)(trained.export)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line; bad input ends in one message and exit status 2.
+    """Run the command line; for bad input, print one message and exit with status 2.
 
     Args:
         arguments: The words after `crossgrad`; `sys.argv[1:]` by default.

@@ -181,7 +181,7 @@ def _parameters() -> Iterator[Parameter]:
 
 
 def _setting(option: Option) -> Parameter:
-    """Return the parameter of a setting; its value is None if the user does not give it."""
+    """Return the parameter of a setting; it is None if the user does not give the setting."""
     flag = option.flag
     info = (
         typer.Option(
@@ -198,7 +198,7 @@ def _setting(option: Option) -> Parameter:
 
 
 def _with_options(function: Callable[..., None]) -> Callable[..., None]:
-    """Return the function with the signature from which typer reads options."""
+    """Return the function with a signature that lists all options; typer reads this signature."""
     parameters = list(_parameters())
     function.__dict__["__signature__"] = Signature(parameters)
     function.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
@@ -209,8 +209,8 @@ def _with_options(function: Callable[..., None]) -> Callable[..., None]:
 def run(**given: Any) -> None:  # noqa: ANN401 - typed by the schema
     """Train on a scene, evaluate, and write the results to a folder.
 
-    Every setting has a default; what a run decided is written to its config.yaml, and
-    `crossgrad run --config config.yaml` repeats it.
+    Every setting has a default. The run writes its decisions to config.yaml in its folder. The
+    command `crossgrad run --config config.yaml` repeats the run.
     """
     announce(quiet=given["quiet"])
     if given["resume"] is not None:

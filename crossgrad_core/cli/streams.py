@@ -1,4 +1,4 @@
-"""Standard streams that never end a command: for closed readers and for limited encodings."""
+"""Standard streams that never end a command, for closed pipes and limited encodings."""
 
 import io
 import os
@@ -16,7 +16,7 @@ _HIGHEST: Final = 2  # stderr
 
 
 def outlast_readers() -> None:
-    """Make stdout and stderr ignore failed writes, and escape characters that are not plain text.
+    """Make stdout and stderr ignore failed writes and escape characters that they cannot show.
 
     Otherwise a closed pipe (`| head`), a lost terminal or a full disk would end hours of training
     at the next progress line. A folder name with characters outside the terminal's encoding would
@@ -54,7 +54,7 @@ def _occupy() -> None:
 
 
 def _lasting(stream: TextIO | None) -> TextIO:
-    """Return a stream to the same file that never fails.
+    """Return a stream that writes to the same file and ignores failed writes.
 
     Streams of other kinds (a Windows console) are returned unchanged.
     """

@@ -111,7 +111,7 @@ def export(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
 
 
 class Split(StrEnum):
-    """The choice of views to draw."""
+    """The set of views to render."""
 
     TEST = "test"
     TRAIN = "train"

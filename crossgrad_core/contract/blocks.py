@@ -17,14 +17,14 @@ Parameters: TypeAlias = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class LearningRate:
-    """A log-linear learning rate from `initial` to `final` over the schedule; a rate of 0 stays 0.
+    """A log-linear learning rate from `initial` to `final` over the schedule; 0 stays 0.
 
     Attributes:
-        initial: Rate at the first step.
-        final: Rate at the end of the schedule; None means `initial`.
-        few_passes: Factor for this rate in a run with few passes over the photos
-            (docs/schedules.md), in addition to the factors for all rates of the backbone.
-            The factor must be positive.
+        initial: Learning rate at the first step.
+        final: Learning rate at the end of the schedule; None means `initial`.
+        few_passes: Positive factor for this learning rate in a run with few passes over the photos
+            (docs/schedules.md). The factors for all learning rates of the backbone apply in
+            addition.
 
     Source: 3DGS; lr(t) = exp((1-u) ln a + u ln b), u = clip(t / T, 0, 1).
     """
@@ -34,11 +34,11 @@ class LearningRate:
     few_passes: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check that the rates are valid for a schedule.
+        """Check that the learning rates are valid for a schedule.
 
         Raises:
-            ValueError: A rate is negative or not finite, or decays to 0, or `few_passes` is not
-                positive.
+            ValueError: A learning rate is negative or not finite, or decays to 0; or `few_passes`
+                is not positive.
         """
         rates = [rate for rate in (self.initial, self.final) if rate is not None]
         if not all(0.0 <= rate < inf for rate in rates):
@@ -52,11 +52,11 @@ class LearningRate:
 
     @property
     def decays(self) -> bool:
-        """True if the rate changes over the schedule."""
+        """True if the learning rate changes over the schedule."""
         return self.final is not None and self.initial not in {0.0, self.final}
 
     def at(self, progress: float) -> float:
-        """Return the rate after a share `progress` of the schedule (clipped to [0, 1])."""
+        """Return the learning rate after a share `progress` of the schedule, clipped to [0, 1]."""
         if self.final is None or not self.decays:
             return self.initial
         u = min(max(progress, 0.0), 1.0)
@@ -73,8 +73,8 @@ class Block:
             tensor's name.
         per_primitive: True if the first dimension of every tensor is the number of primitives.
         kind: Geometry, appearance or neutral (for granularity `kind` and per-block dispatch).
-        lr: Learning rate of all its tensors. 0 freezes the block: its tensors get no gradient, may
-            have any type, and are used in topology edits and checkpoints only.
+        lr: Learning rate of all tensors of the block. 0 freezes the block: its tensors get no
+            gradient, may have any type, and are used in topology edits and checkpoints only.
         rests: True if the block's tensors hold details of the colour, such as spherical harmonics
             of higher degrees, that need not learn in every step.
     """
@@ -87,11 +87,12 @@ class Block:
     rests: bool = False
 
     def __post_init__(self) -> None:
-        """Check the fields here, so that an error does not appear only during training.
+        """Check the fields, because otherwise an error would appear only during training.
 
         Raises:
             ValueError: The kind is not one of `BlockKind`.
-            TypeError: The names of the tensors are not a tuple, or the rate is a plain number.
+            TypeError: The names of the tensors are not a tuple, or the learning rate is a plain
+                number.
         """
         if self.kind not in get_args(BlockKind):
             kinds = get_args(BlockKind)
@@ -132,7 +133,7 @@ class PluginState:
     the state. Store sums, or a window of at most 1,000 steps.
 
     Attributes:
-        values: Plain numbers, strings, lists and dictionaries (must survive JSON).
+        values: Plain numbers, strings, lists and dictionaries that JSON can store.
         tensors: Tensors of any shape.
         per_primitive: Tensors whose first dimension is the number of primitives. A topology edit
             gathers the rows of these tensors together with the parameters (rows of new primitives
@@ -165,8 +166,8 @@ class PluginState:
         """Return the state after a topology edit.
 
         Args:
-            source: [M] int64, for each new primitive the old primitive whose row it copies.
-            fresh: [M] bool, primitives whose rows start at zero.
+            source: [M] int64, index of the old primitive whose row each new primitive copies.
+            fresh: [M] bool, True for new primitives whose rows start at zero.
         """
         rows = {name: carried(old, source, fresh) for name, old in self.per_primitive.items()}
         return PluginState(self.values, self.tensors, rows)
@@ -225,7 +226,7 @@ class Edit:
 
     @property
     def is_empty(self) -> bool:
-        """True if the edit changes nothing and counts nothing."""
+        """True if the edit changes no primitive and contains no counts."""
         return self.keeps_rows and not self.values and not self.counts
 
     @property
@@ -362,7 +363,7 @@ MOST_VIEWS: Final = 10
 
 @dataclass(frozen=True)
 class AdamState:
-    """Moments and step counts by tensor name; a name appears with its first gradient.
+    """Moments and step counts by tensor name; the first gradient of a tensor adds its name.
 
     Attributes:
         exp_avg: First moments, each shaped like its parameter.
@@ -382,7 +383,7 @@ class AdamRule:
     Attributes:
         betas: Decay of the first and the second moment, each in [0, 1).
         eps: Added to the root of the second moment.
-        age: Factor for a tensor's count of steps in the bias correction.
+        age: Factor that multiplies a tensor's number of steps in the bias correction.
     """
 
     betas: tuple[float, float] = BETAS
@@ -393,15 +394,15 @@ class AdamRule:
     def for_views(
         cls, views: int, age: float = 1.0, betas: tuple[float, float] = BETAS
     ) -> "AdamRule":
-        """Return the batch rule: moments decay as much per view as with one view per step.
+        """Return the batch rule: 1 - beta of both moments is multiplied by the number of views.
 
         The batch rule also multiplies learning rates by sqrt(K); the caller does this.
 
         Args:
             views: K, at most `MOST_VIEWS`.
-            age: Number of steps that would render the run's views with K views each, divided by the
-                run's number of steps; it differs from 1 only if K changed.
-            betas: Decays with one view per step.
+            age: Number of steps that the run would need if every step had K views, divided by the
+                run's actual number of steps. The quotient differs from 1 only if K changed.
+            betas: Decay factors of the moments for one view per step.
 
         Source: gsplat; Malladi et al. 2022 (square-root scaling), with K views in place of K
         batches.

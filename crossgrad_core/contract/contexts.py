@@ -55,7 +55,7 @@ class RenderedView:
         scale: Side length of the render divided by the side length of the photo as trained.
         gaussians: The Gaussians that were rendered.
         screen: Screen statistics in pixels of the render, with gradients if a backward pass has
-            run. `contract.screen_statistics` converts them to units of the full photo.
+            run. `contract.screen_statistics` converts the statistics to units of the full photo.
         image: [H, W, 3] the image that is compared with the photo: the render after exposure.
         photo: [H, W, 3] uint8 photo, in the size of the render.
         mask: [H, W] bool, True where the pixel counts; None if every pixel counts.
@@ -99,7 +99,7 @@ class StepRecord:
         views: Positions in `scene.train_views`.
         names: Names of the views.
         labels: Group labels of the views, or None.
-        losses: Photometric losses of the views, in the same order.
+        losses: Photometric losses of the views, in the order of `views`.
         primitives: Number of primitives after the step.
         counts: Counted events: `zero`, `disjoint`, `dropped`, `conflict` blocks of the aggregation,
             `cloned`, `split`, `pruned`, `reset` primitives of the densification.
@@ -159,7 +159,7 @@ class RenderOnRequest(Protocol):
         """Return the rendered view.
 
         The render is part of a graph if gradients are enabled (`torch.enable_grad()`). A densifier
-        that needs no gradients calls this under `torch.no_grad()`.
+        that needs no gradients calls this function under `torch.no_grad()`.
 
         Args:
             view: Position in `scene.train_views`.
@@ -193,9 +193,11 @@ class StepContext:
         schedule: The schedule of the run.
         scene: The scene.
         states: State of every plugin by the plugin's name; read only.
-        rng: The random generator of the hook. Every random number of a plugin must come from it.
-        photo: Returns the photo and the mask of a view on the run's device. The time for decoding
-            then counts as loading time; with `view.photo` it would count as training time.
+        rng: The random generator of the hook. Every random number of a plugin must come from this
+            generator.
+        photo: Returns the photo and the mask of a view on the run's device. The decoding time then
+            counts as loading time. If a plugin uses `view.photo` instead, the decoding time counts
+            as training time.
     """
 
     step: int
@@ -271,11 +273,13 @@ class AggregateContext(StepContext):
     """The context of `crossgrad_aggregate_gradients`.
 
     Attributes:
-        gradients: The gradients of the K views; separate if the operator or a plugin requires it.
+        gradients: The gradients of the K views; separate if the operator or a plugin requires
+            separate gradients.
         losses: [K] float64 photometric losses.
         labels: K group labels, or None.
         distances: [K] float64 distance of each camera from the mean training camera, local units.
-        reference_distance: Median of this distance over all training cameras.
+        reference_distance: Median of the distances of all training cameras from the mean training
+            camera.
         blocks: The blocks, in the order of every Gramian's first dimension.
         scales: K scales at which losses and gradients were computed; empty if all are 1.
     """
@@ -311,9 +315,9 @@ class RegularizeContext(StepContext):
     Attributes:
         parameters: The parameters, requiring gradients.
         backbone: The backbone.
-        gaussians: The Gaussians that the backbone decoded for this view, with their graph; None in
-            the call per step.
-        view: The view; None in the call per step.
+        gaussians: The Gaussians that the backbone decoded for this view, with their graph; None if
+            the hook is called for the whole step.
+        view: The view; None if the hook is called for the whole step.
     """
 
     parameters: Mapping[str, Tensor]
@@ -506,16 +510,18 @@ class OperatorContext:
         losses: [K] float64 photometric losses.
         labels: K group labels, or None.
         distances: [K] float64 camera distances from the mean training camera, local units.
-        reference_distance: Median of this distance over all training cameras.
-        present: [B, K] bool, views whose gradient of the block is finite and not zero. The rows and
-            columns of all other views are zero in the Gramian; an operator must give these views
-            weight 0.
-        unit: Unit roundoff of the gradients' type. A relative error smaller than the unit roundoff
-            is not required.
+        reference_distance: Median of the distances of all training cameras from the mean training
+            camera.
+        present: [B, K] bool, views whose gradient of the block is finite and not zero. For a view
+            that is False here, the row and column of the Gramian are zero, and the operator must
+            return weight 0.
+        unit: Unit roundoff of the gradients' type. Results need not be more accurate than the unit
+            roundoff.
         rounding_residuals: Computes [B, K, K], the parts of the Gramians that rounding to float64
-            removed. Gramian plus residual gives twice the digits. The computation needs another,
-            slower pass over the gradients; it is meant for Gramians that are so close to singular
-            that rounding affects the result. None if no residuals can be computed.
+            removed. The sum of Gramian and residual has twice as many correct digits. The
+            computation needs another, slower pass over the gradients. Use it only for Gramians that
+            are almost singular, because rounding then affects the result. None if no residuals can
+            be computed.
         scales: K scales at which losses and gradients were computed; empty if all are 1.
     """
 

@@ -17,8 +17,8 @@ class Decision:
         value: The value of the setting.
         because: The reason, in a few words.
         evidence: The facts or the results that support the reason.
-        override: The option that sets another value; empty if the value is the published one, which
-            the terminal does not report.
+        override: The option that sets another value. Empty if the value is the published value; the
+            terminal does not report such decisions.
     """
 
     setting: str
@@ -30,11 +30,12 @@ class Decision:
 
 @dataclass(frozen=True)
 class Length:
-    """The run length, as far as decisions depend on it.
+    """The length of a run and its number of primitives, on which decisions depend.
 
     Attributes:
-        planned: Steps that the run was planned with.
-        total: Present number of steps, after the clock made the run longer or shorter.
+        planned: Planned number of steps.
+        total: Present number of steps. It differs from `planned` if a time budget made the run
+            longer or shorter.
         start: Number of primitives at the start; None before they are counted.
     """
 

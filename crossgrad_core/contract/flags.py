@@ -1,4 +1,4 @@
-"""How a setting appears on the command line, next to its type and bounds in the schema."""
+"""How a setting appears on the command line. The schema contains its type and bounds."""
 
 from dataclasses import dataclass
 from typing import Final

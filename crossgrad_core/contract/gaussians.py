@@ -54,7 +54,7 @@ class Gaussians:
             resulting Gaussian; None if all were decoded.
         on_demand: Tensors whose rows must be requested before they are read. The gradients of these
             tensors are sparse, by rows. None if all rows are up to date. Only rasterizers with
-            `sparse_rows` receive it.
+            `sparse_rows` receive this field.
     """
 
     means: Tensor
@@ -155,21 +155,24 @@ class Screen:
     Attributes:
         radii: [N] int32, pixels; 0 if the Gaussian touches no pixel.
         pixels: [N] int32, pixels in which the Gaussian was blended; None unless requested.
-        mean_gradient: [N, 2] gradient of the loss by the projected mean, per pixel unit.
+        mean_gradient: [N, 2] gradient of the loss with respect to the projected mean, in pixel
+            coordinates.
         abs_gradient: [N, 2] like `mean_gradient`, but with the absolute values summed over the
             pixels; None unless requested.
-        directions: [N, 6, 5] the pixels' gradients by the projected mean, in 6 bins along the
-            longest axis; None unless requested. The axis is the axis of the largest scale (the
-            first one of equal scales), projected to the image plane. Let a be the projection,
-            without dilation, of one standard deviation along this axis. A pixel whose centre has
-            the offset d from the projected mean is at t = d . a / |a|^2, or at t = 0 if a is
-            shorter than 1e-6 px. The upper ends of the bins are -2, -1, 0, 1, 2 and infinity. Each
-            bin contains 5 numbers of its pixels whose gradient is not 0: the sum of the directions
-            (x and y; unit vectors of the gradient in NDC units, that is times width and height),
-            the sums of |x| and |y| of the gradient itself (per pixel unit; summed over all bins
-            they are `abs_gradient`), and the number of these pixels.
-        count: [H, W] bool -> [N] int32, in how many of these pixels the Gaussian was blended; None
-            unless requested. The function keeps the data of the render in memory that it needs.
+        directions: [N, 6, 5] gradients of single pixels with respect to the projected mean, in 6
+            bins along the longest axis; None unless requested. The axis is the axis of the largest
+            scale (the first one of equal scales), projected to the image plane. Let a be the
+            projection, without dilation, of one standard deviation along this axis. A pixel whose
+            centre has the offset d from the projected mean is at t = d . a / |a|^2, or at t = 0 if
+            a is shorter than 1e-6 px. The upper ends of the bins are -2, -1, 0, 1, 2 and infinity.
+            Each bin contains 5 numbers about its pixels whose gradient is not 0. The first two
+            numbers are the sum of the gradients' directions (x and y). A direction is the unit
+            vector of the gradient in NDC units, that is, of the gradient times width and height.
+            The next two numbers are the sums of |x| and |y| of the gradients in pixel coordinates;
+            summed over all bins they are `abs_gradient`. The last number is the number of pixels
+            with a gradient that is not 0.
+        count: Function [H, W] bool -> [N] int32: in how many of the marked pixels each Gaussian was
+            blended; None unless requested. The function keeps data of the render in memory.
         rows: [R] int64, sorted; contains every Gaussian with a radius above 0. None if the
             rasterizer provides no such list.
     """

@@ -1,4 +1,4 @@
-"""Gradients of K views, which operators use through Gramians, weighted sums and maps only."""
+"""Gradients of K views. Operators use only Gramians, weighted sums and element-wise functions."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -39,7 +39,7 @@ class Gradients(ABC):
 
         Args:
             name: Name of the parameter tensor.
-            gradient: A gradient of this parameter, as `total` returned it or any other tensor.
+            gradient: A gradient of this parameter: a result of `total`, or any other tensor.
         """
         return False
 
@@ -47,11 +47,11 @@ class Gradients(ABC):
     def total(self, divisor: int = 1) -> Mapping[str, Tensor | None]:
         """Return the sum over the views for each tensor, in the order of the views.
 
-        The bits are the same as with accumulation in the backward passes.
+        Accumulation in the backward passes would give the same bits.
 
         Args:
-            divisor: The sums are divided by this number; with K the result is the mean, without a
-                further pass over the data.
+            divisor: Number by which the sums are divided, without a further pass over the data. If
+                it is K, the result is the mean.
 
         Returns:
             Tensor name -> sum; None for tensors that no view touches, or whose views are all
@@ -63,7 +63,7 @@ class Gradients(ABC):
 class SeparateGradients(Gradients):
     """The separate gradients of the K views of one step; operators do not see their elements.
 
-    `elementwise` passes dense tensors to its function and expects dense tensors.
+    `elementwise` passes dense tensors to its function and expects dense results.
     """
 
     @abstractmethod
@@ -83,7 +83,8 @@ class SeparateGradients(Gradients):
     def rounding_residuals(self, granularity: Granularity) -> NDArray[np.float64]:
         """Return [B, K, K], the parts of the Gramians that rounding removed.
 
-        Gramian plus residual gives twice the digits. The call is ten times as slow as `gramians`.
+        The sum of Gramian and residual has twice as many correct digits. The call is ten times as
+        slow as `gramians`.
         """
 
     @override

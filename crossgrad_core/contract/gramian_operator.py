@@ -47,7 +47,7 @@ class MatrixOperator(Operator):
 
         Returns:
             [B, R, K] float64 matrices M (the operator chooses R) and the new state. A chain of
-            operators multiplies the matrices: the next link receives M Gram M^T.
+            operators multiplies the matrices: the next operator receives M Gram M^T.
         """
 
     @override
@@ -84,7 +84,7 @@ class GramianOperator(MatrixOperator):
 class Weighting(GramianOperator):
     """A Gramian operator that gives each view one weight per block, without memory of past steps.
 
-    In a chain, the next link receives the K weighted gradients.
+    In a chain, the next operator receives the K weighted gradients.
     """
 
     @abstractmethod
@@ -131,10 +131,11 @@ def aggregate_by_gramians(
     This takes one pass for the Gramians of all blocks, one small solve, and one pass for the
     weighted sums.
 
-    The result counts the blocks (Gramians, under other granularities) in which one of four events
-    occurred: a view has an exactly zero or no gradient (`zero`), two non-zero gradients have no
-    common element (`disjoint`), a view was left out because its gradient is not finite (`dropped`),
-    or two gradients have a negative dot product (`conflict`).
+    The result counts the blocks in which one of four events occurred; with another granularity, it
+    counts the Gramians. The events are: a view has no gradient or a gradient of exactly zero
+    (`zero`), two non-zero gradients have no common element (`disjoint`), a view was left out
+    because its gradient is not finite (`dropped`), or two gradients have a negative dot product
+    (`conflict`).
 
     Raises:
         UserError: The operator returned weights that are not finite.

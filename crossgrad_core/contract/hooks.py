@@ -71,7 +71,7 @@ class HookSpecs:
 
     @hookspec
     def crossgrad_view_gaussians(self, context: "GaussiansContext") -> "GaussiansResult | None":
-        """Return the Gaussians for the render of a training view, if not the decoded Gaussians.
+        """Return the Gaussians to render for a training view; None keeps the Gaussians unchanged.
 
         All plugins are called in turn, once per view. Each plugin gets the Gaussians that the
         previous plugin returned.
@@ -139,7 +139,7 @@ class HookSpecs:
 
     @hookspec
     def crossgrad_model_ready(self, model: "Model") -> None:
-        """Event: the step is complete. The model is read only; the time does not count."""
+        """Event: the step is complete. The model is read-only; training time excludes this hook."""
 
     @hookspec
     def crossgrad_eval_parameters(

@@ -10,7 +10,7 @@ from crossgrad_core.contract.slots.rasterizer import Rasterizer
 
 
 def objections_to(selection: Selection) -> list[str]:
-    """Return reasons why the selection cannot work, for components of any author."""
+    """Return the core's reasons why the selected components cannot work together."""
     return [
         *_of_the_sampler(selection),
         *objections_to_views(selection.operator, selection),
@@ -100,7 +100,7 @@ def unused_options(component: Component, selection: Selection) -> Mapping[str, s
 
 
 def set_for_nothing(component: Component, selection: Selection) -> dict[str, str]:
-    """Return the unused options that were set to a value other than their default."""
+    """Return the unused options whose values are not their defaults."""
     fields = type(component).model_fields
     return {
         name: why

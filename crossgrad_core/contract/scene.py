@@ -317,7 +317,7 @@ class Scene:
     check: Mapping[str, Json] | None = None
 
     def with_points(self, rows: NDArray[np.int64]) -> "Scene":
-        """Return the scene with only the points in `rows` [Q] (ascending); views get new rows."""
+        """Return the scene with only the points in `rows` [Q] (ascending); `seen` is updated."""
         new_rows = np.full(len(self.points), -1)
         new_rows[rows] = np.arange(len(rows))
 
@@ -368,7 +368,7 @@ class Scene:
 
     @cached_property
     def distances(self) -> NDArray[np.float64]:
-        """[N] distance of each training camera from their mean, local units."""
+        """[N] distance of each training camera from the mean camera centre, local units."""
         return np.asarray(np.linalg.norm(self.centers - self.middle, axis=1))
 
 
@@ -403,8 +403,8 @@ def without_rounding(scene: Scene, lengths: NDArray[np.float64]) -> NDArray[np.f
 
     In regular camera layouts, equal distances differ by the rounding error of the mean camera
     centre. A threshold at the median, a rank or a logarithm would depend on this rounding error. If
-    the input coordinates of the scene are so large that their rounding error is larger, the lengths
-    are rounded to that error.
+    the rounding error of the scene's input coordinates is larger than this, the lengths are rounded
+    to the larger error.
     """
     largest = float(np.abs(scene.centers).max(initial=0.0))
     given = float(np.abs(scene.similarity.to_input(scene.centers)).max(initial=0.0))
@@ -424,7 +424,7 @@ def footprint(camera: Camera, points: NDArray[np.float64], seen: NDArray[np.int6
     """Return the median of f / z [pixels per local unit] over a camera's observed SfM points.
 
     If the camera observed fewer than 3 points in front of it, all points in its image are used
-    instead; the result is NaN without any point.
+    instead. If there are no such points either, the result is NaN.
 
     Args:
         camera: The camera, in the size of the photo as trained.

@@ -43,7 +43,7 @@ class ViewsPerStep:
         return start + max(0, -((self.views(start) - views) // count))
 
     def moved(self, wanted: "ViewsPerStep", step: int) -> "ViewsPerStep":
-        """Return these values of K with the change points of another run, if these are still ahead.
+        """Return these values of K, with the changes that are still ahead moved as in `wanted`.
 
         Args:
             wanted: K of a run of another length.
@@ -60,7 +60,7 @@ ONE_BY_ONE: Final = ViewsPerStep()
 
 @dataclass(frozen=True)
 class ViewsPerStepSpec:
-    """K over a run of any length: one number, or several numbers with the shares of their start.
+    """K over a run of any length: one number, or several numbers that start at given shares.
 
     Attributes:
         counts: The values of K.
@@ -149,24 +149,24 @@ LEAST_INTERVAL = 8
 
 
 def is_published(mode: ScheduleMode, reference: int | None) -> bool:
-    """Return True if a schedule uses the published numbers for any length of the run."""
+    """Return True if a schedule uses the published numbers, whatever the length of the run."""
     return mode == "absolute" and reference is None
 
 
 @dataclass(frozen=True)
 class Counting:
-    """The unit in which a schedule counts, and the quantities that the unit requires.
+    """The unit in which a schedule counts, and properties of the run that affect the schedule.
 
     Attributes:
         unit: The unit of the schedule's numbers, views or steps.
         views: Number of views per step.
         photos: Number of training photos. An edit uses the statistics of at least this many views
             if the run is long enough.
-        schedule_length: Length that the schedule is written for; None for the length of the run
-            or the published length.
+        schedule_length: Length that the schedule is written for. None stands for the length of the
+            run, or for the published length.
         min_refinements: Minimum number of density control edits in a run of any length. In a short
-            run, warm-up and interval are shortened to reach this number. Used if the schedule
-            counts views.
+            run, warm-up and interval are shortened to reach this number. This field is used only if
+            the schedule counts views.
     """
 
     unit: Unit = "steps"
@@ -203,8 +203,8 @@ class Schedule:
         sh_wait: Count before which the SH degree does not grow.
         counting: The unit of the counts.
         pace: K of every step.
-        edits_before: Number of edits before `densify_from` in a run whose length followed the
-            clock.
+        edits_before: Number of edits before `densify_from` in a run whose length a time budget
+            changed.
         min_refinements: Minimum number of edits that a change of length keeps, if the run is long
             enough.
     """
@@ -266,8 +266,9 @@ class Schedule:
         """Return the schedule with another window of density control.
 
         If edits are counted in views, interval and start are fitted to the window. An interval is
-        one pass over the training photos if this leaves at least `USUAL_EDITS` edits, and the
-        window contains at least `min_refinements` edits.
+        at least one pass over the training photos if the window then still contains `USUAL_EDITS`
+        edits. The start and the interval are shortened if the window would contain fewer than
+        `min_refinements` edits.
 
         Args:
             until: Edits end before this count.
@@ -292,7 +293,7 @@ class Schedule:
         return is_published(self.mode, self.counting.schedule_length)
 
     def counted(self, step: int) -> int:
-        """Return the count after a step: the number of views drawn so far, or of steps."""
+        """Return the count after a step: the number of drawn views, or the number of steps."""
         return self.pace.views(step) if self.counting.unit == "views" else step
 
     def step_of(self, count: int) -> int:
@@ -334,7 +335,7 @@ class Schedule:
         return self.step_of(self.next_edit(0))
 
     def next_edit(self, count: int) -> int:
-        """Return the count of the first edit after `count`, without regard to the end of edits."""
+        """Return the count of the first edit after `count`, even if this is after the last edit."""
         # If steps are counted, edits are at multiples of the interval, as published.
         every, origin = self.densify_every, 0
         if self.counting.unit == "views":
@@ -346,10 +347,11 @@ class Schedule:
         """Return this schedule with the length of another schedule, from the end of a step on.
 
         The ends of the run, of the learning-rate decay and of density control move if they are
-        still ahead, and so does a change of K. Intervals are kept, so that no event happens twice
-        or is omitted. Density control does not restart after its end, and open levels and drawn
-        harmonics stay. If a minimum number of edits is set, the remaining edits are planned again:
-        the start if no edit was made yet, and the interval if there would be too few edits.
+        still ahead. Changes of K that are still ahead move as well. Intervals do not change, so
+        that no event happens twice or is omitted. Density control does not restart after its end.
+        Levels and spherical harmonics that are already in use stay in use. If a minimum number of
+        edits is set, the remaining edits are planned again. The start of the edits moves if no edit
+        was made yet. The interval shrinks if there would be too few edits.
 
         Args:
             wanted: The schedule of a run that had this length from its start.
@@ -391,8 +393,8 @@ class Schedule:
     def prunes_large(self, step: int) -> bool:
         """Return True if an edit after this step removes primitives that are large in world space.
 
-        This is the case after the first opacity reset, as published, and never in runs without
-        resets.
+        As published, edits remove large primitives after the first opacity reset, and never in runs
+        without resets.
         """
         return self.reset_every is not None and self.counted(step - 1) >= self.reset_every
 
@@ -405,7 +407,7 @@ class Schedule:
 
 
 def _with_edits_ahead(schedule: Schedule, wanted: Schedule, step: int) -> Schedule:
-    """Return the schedule from the end of a step on, with the edits of `wanted`."""
+    """Return the schedule with the edits of `wanted` in place of all edits after `step`."""
     now = schedule.counted(step)
     done = schedule.edits_before + schedule.edits() - schedule.edits(step)
     missing = max(0, schedule.min_refinements - done)
@@ -435,7 +437,8 @@ def _fitted(start: int, last: int, every: int, photos: int, edits: int) -> tuple
         start: Wanted start.
         last: Largest allowed count of the last edit.
         every: Wanted interval.
-        photos: The interval is at least this long if this leaves enough edits.
+        photos: Number of training photos. The interval is at least this long if `edits` edits still
+            fit.
         edits: Wanted number of edits.
     """
     wanted = start + edits * every
@@ -464,8 +467,8 @@ class Phase:
 def shortness(views: float) -> float:
     """Return 1 for runs of up to `SHORT` views, 0 from the published length on.
 
-    In between, the value falls with the logarithm of the length. Settings that suit only short runs
-    lose their effect gradually with this value.
+    In between, the value falls with the logarithm of the length. Settings for short runs lose their
+    effect gradually as this value falls.
     """
     short = log(REFERENCE / max(1.0, views)) / log(REFERENCE / SHORT)
     return min(1.0, max(0.0, short))

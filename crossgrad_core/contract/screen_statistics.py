@@ -1,7 +1,8 @@
 """Screen statistics of a rendered view at any scale, per Gaussian and per primitive.
 
-All values are in units of the full photo: gradients per NDC unit, radii divided by the longer side,
-pixels of the photo as trained. A loss is a mean over pixels, so its gradients need no other factor.
+All values are in units of the full photo. Gradients are with respect to NDC coordinates, radii are
+divided by the longer image side, and pixel counts refer to the photo as trained. A loss is a mean
+over pixels, so its gradients need no factor for the number of pixels.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,18 +15,25 @@ from crossgrad_core.contract.contexts import DensifyContext, RenderedView
 
 
 def half_size(record: RenderedView, like: Tensor) -> Tensor:
-    """Return [2], the pixels of the render per NDC unit: W/2, H/2 (3DGS)."""
+    """Return [2], half the width and height of the render: the pixels per NDC unit (3DGS)."""
     camera = record.camera
     return torch.tensor([camera.width / 2, camera.height / 2]).to(like, non_blocking=True)
 
 
 def ndc_gradient(record: RenderedView, rows: Tensor | None = None) -> Tensor:
-    """Return [N, 2] ([S, 2] for `rows`), the loss gradient by the projected mean, per NDC unit."""
+    """Return [N, 2], the gradient of the loss with respect to the projected means, in NDC.
+
+    With `rows` [S], return [S, 2], the gradients of these Gaussians only.
+    """
     return _of_rows(record, record.screen.mean_gradient, rows)
 
 
 def ndc_abs_gradient(record: RenderedView, rows: Tensor | None = None) -> Tensor:
-    """Return [N, 2], the summed absolute pixel gradients by the projected mean, per NDC unit."""
+    """Return [N, 2], the absolute gradients with respect to the projected means, in NDC.
+
+    The absolute values of the gradients of single pixels are summed over all pixels. With `rows`
+    [S], return [S, 2], the sums of these Gaussians only.
+    """
     return _of_rows(record, record.screen.abs_gradient, rows)
 
 
@@ -36,7 +44,7 @@ def _of_rows(record: RenderedView, statistic: Tensor | None, rows: Tensor | None
 
 
 def directions(record: RenderedView) -> Tensor:
-    """Return `Screen.directions` as [6, 5, N], with the absolute gradients per NDC unit.
+    """Return `Screen.directions` as [6, 5, N], with its absolute gradients converted to NDC.
 
     The dimensions are bins, fields, Gaussians. With the Gaussians last, sums over bins are sums of
     whole rows, which is much faster on the CPU.
@@ -77,8 +85,8 @@ def visible(record: RenderedView, rows: Tensor | None = None) -> Tensor:
 def seen(record: RenderedView) -> Tensor | None:
     """Return [S] int64 rows of the Gaussians that touched a pixel; sums need only these rows.
 
-    On a GPU, return None, which means all rows, because the host would have to wait for their
-    number.
+    On a GPU, return None, which means all rows, because the host would have to wait for the number
+    of rows.
     """
     radii, rows = record.screen.radii, record.screen.rows
     if not radii.is_cpu:
@@ -97,7 +105,7 @@ def _present(statistic: Tensor | None) -> Tensor:
 
 
 def sums(context: DensifyContext, state: PluginState, names: Sequence[str]) -> dict[str, Tensor]:
-    """Return copies of the running sums [P] with these names; zeros at first."""
+    """Return copies of the running sums [P] with these names; zeros before the first step."""
     like = next(iter(state.per_primitive.values()), None)
     if like is None:
         backbone = context.backbone
@@ -109,7 +117,7 @@ def sums(context: DensifyContext, state: PluginState, names: Sequence[str]) -> d
 
 
 def add(record: RenderedView, total: Tensor, values: Tensor, rows: Tensor | None = None) -> None:
-    """Add a value of each Gaussian [N] (or of each one in `rows`) to its primitive's sum [P]."""
+    """Add the value of each Gaussian, [N] or only those in `rows`, to its primitive's sum [P]."""
     origin = record.gaussians.origin
     if origin is not None:
         total.index_add_(0, origin if rows is None else origin.index_select(0, rows), values)

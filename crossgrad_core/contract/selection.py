@@ -23,7 +23,7 @@ from crossgrad_core.contract.slots.sampler import Sampler
 
 @dataclass(frozen=True)
 class Selection:
-    """The chosen components of a run, for the check of their combination.
+    """The chosen components of a run, for checking whether the components work together.
 
     Attributes:
         backbone: The backbone.
@@ -68,7 +68,7 @@ class Selection:
 
     @property
     def views(self) -> ViewsPerStepSpec:
-        """K over the run."""
+        """The number of views K of every step of the run."""
         return self.view_plan or ViewsPerStepSpec((self.views_per_step,))
 
     @property

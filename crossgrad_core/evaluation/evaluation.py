@@ -45,7 +45,8 @@ def evaluate(
     """Render and measure the views, one at a time.
 
     Args:
-        views: The held-out views; without any view, all metrics are null, with the reason.
+        views: The held-out views. If there are none, all metrics are null, and the result gives the
+            reason.
         render_one: Returns the [H, W, 3] float image of a view, on any device; the values need not
             be clamped.
         metrics: The metrics to measure.

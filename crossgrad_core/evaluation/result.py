@@ -32,7 +32,7 @@ class ViewMetrics:
 
 @dataclass(frozen=True)
 class Means:
-    """Means over `views` views without fully masked views; None if no view has the metric."""
+    """Means over `views` views, fully masked views excluded; None if no view has the metric."""
 
     views: int
     values: Mapping[str, float | None]

@@ -1,7 +1,7 @@
 """The running sum of the gradients of K views on a GPU; the host waits only when the sum is read.
 
-`SummedGradients` checks the gradients of each view when they are added. On a GPU, this would make
-the host wait K times for each tensor.
+`SummedGradients` checks the gradients of each view when they are added. On a GPU, these checks
+would make the host wait K times for each tensor.
 """
 
 from collections.abc import Mapping, Sequence
@@ -100,7 +100,7 @@ class DeferredSums(Gradients):
 
     @cached_property
     def _read(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Two arrays [B, K]: views with finite gradients, and views with non-zero finite ones."""
+        """Two arrays [B, K]: True for finite gradients, and True for finite non-zero gradients."""
         magnitudes = [size for view in self._largest for size in view.values()]
         values = iter(torch.stack(magnitudes).tolist() if magnitudes else ())
         sizes = [{name: next(values) for name in view} for view in self._largest]

@@ -86,7 +86,7 @@ def row_gramians(columns: Sequence[Column], rows: int) -> NDArray[np.float64]:
 
 
 def row_combine(column: Column, weights: NDArray[np.float64], out: Tensor) -> None:
-    """Write the row-wise weighted sum of a column; `weights` is [N, K], and 0 leaves a row out."""
+    """Write the row-wise weighted sum of a column; in `weights` [N, K], 0 leaves out a row."""
     rows = len(weights)
     total = torch.zeros_like(out, dtype=torch.float64).view(rows, -1)
     factors = torch.from_numpy(np.ascontiguousarray(weights.T)).to(out.device, non_blocking=True)

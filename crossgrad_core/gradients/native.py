@@ -47,7 +47,7 @@ def gramians(columns: Sequence[Column]) -> NDArray[np.float64]:
 
 
 def spread_gramian(column: Column, rows: Tensor, count: int) -> NDArray[np.float64]:
-    """Return the [K, K] Gramian of gradients in `rows` of `count` rows, bit by bit as if dense."""
+    """Return the [K, K] Gramian of gradients in `rows` of `count`, bit-equal to dense gradients."""
     from crossgrad_core.gradients.numba_kernels import dense
     from crossgrad_core.numerics.jobs import parallel
 

@@ -67,14 +67,14 @@ def column_remainders(
 
     Args:
         columns: T columns.
-        group: [T] index of the sum that contains each column; -1 for none.
+        group: [T] index of the sum that contains each column; -1 if no sum contains the column.
         gramians: [B, K, K].
     """
     return rounding_residuals(columns, group, gramians, _scale(columns))
 
 
 def _scale(columns: Sequence[Column]) -> float:
-    """Return the power of two that keeps products of float64 gradients inside float64."""
+    """Return the power of two that keeps products of float64 gradients in the range of float64."""
     touched = [column for column in columns if any(g is not None for g in column)]
     wide = [column for column in touched if _dtype(column) == torch.float64]
     if not wide:

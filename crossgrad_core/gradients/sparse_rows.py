@@ -57,10 +57,10 @@ def dense(gradient: Tensor | None) -> Tensor | None:
 
 
 class PackedRows:
-    """A column of gradients on the union of their rows.
+    """A column of gradients, stored on the union of their rows.
 
     Attributes:
-        column: K gradients of these rows; dense gradients if one of them is dense.
+        column: K gradients of these rows. If one gradient is dense, all are dense.
         rows: [R] int64; None if the gradients are dense.
         shape: Shape of the whole tensor.
     """

@@ -180,7 +180,7 @@ class SummedGradients(Gradients):
     def _judged(
         self, view: Mapping[str, Tensor | None]
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return two arrays [B]: True for finite block gradients, and for finite non-zero ones."""
+        """Return two arrays [B]: True for finite gradients, True for finite non-zero gradients."""
         names = [name for block in self._blocks for name in block.tensors]
         flags = all_finite_and_present([view.get(name) for name in names])
         flags_by_name = dict(zip(names, flags, strict=True))

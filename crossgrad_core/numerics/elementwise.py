@@ -2,8 +2,8 @@
 
 torch divides long tensors among its threads. Scalar code processes the remainder of each part and
 rounds differently from the vectorised code. For functions of the vector library (exp, tanh) the
-results are equal. For the sigmoid the results differ: a few numbers, and with them a whole training
-run, then depend on the number of threads.
+results are equal. For the sigmoid, a few results differ. A whole training run would then depend on
+the number of threads.
 """
 
 from collections.abc import Callable
@@ -27,7 +27,7 @@ def sigmoid(values: Tensor) -> Tensor:
 
 
 class _Sigmoid(torch.autograd.Function):
-    """`sigmoid_` with a gradient whose bits do not depend on the threads, even without blocks."""
+    """`sigmoid_` with a gradient, which has the same bits for any number of threads."""
 
     @staticmethod
     @override

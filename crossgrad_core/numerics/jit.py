@@ -45,8 +45,8 @@ def strict_device(function: Callable[P, R]) -> Callable[P, R]:
 def strict_section(function: Callable[P, R]) -> Callable[P, R]:
     """Mark a section of one strict kernel; its code is inserted before the caller is compiled.
 
-    Parts and devices are optimised separately, and again in each caller. For large functions this
-    takes seconds at every level.
+    Functions from `strict_part` and `strict_device` are optimised separately, and again in each
+    caller. For large functions, each optimisation takes seconds.
     """
     return cast("Callable[P, R]", _COMPILE(inline="always", **_OPTIONS)(function))
 

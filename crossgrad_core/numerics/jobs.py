@@ -1,23 +1,21 @@
 """Dynamic distribution of jobs over threads: each thread takes the next job when it is idle.
 
-A kernel takes jobs until none is left,
+A kernel takes jobs until none is left:
 
     job = next_job(jobs, count)
     while job < count:
         ...
         job = next_job(jobs, count)
 
-and `parallel` calls the kernel on all threads at once. Numba's own `prange` divides the work into
-equal parts in advance and waits for every thread. If a core is busy or slow, waiting takes longer
-than computing with one thread. Here, a helper thread that starts too late is skipped, and idle
-threads sleep.
+`parallel` calls the kernel on all threads at once. Numba's own `prange` divides the work into equal
+parts in advance and waits for every thread. If a core is busy or slow, waiting takes longer than
+computing with one thread. Here, a helper thread that starts too late is skipped, and idle threads
+sleep.
 
 A thread starts with its own range of jobs and continues with the remaining jobs of other threads.
-So in each kernel a thread reads the data that it wrote in the previous kernel, which its core still
-caches.
-
-The result of a job must not depend on the thread that runs it. Then the threads do not affect any
-bit.
+Therefore, a thread reads the data that it wrote in the previous kernel, and the cache of its core
+still contains this data. The result of a job must not depend on the thread that runs the job. Then
+the number of threads does not change any bit of the results.
 """
 # ruff: noqa: ANN401, ARG001 - Numba's objects have no types, and it fixes the arguments.
 
@@ -61,7 +59,7 @@ def next_job(jobs: Jobs, count: int) -> int:
     """Return the number of a free job, or `count` if no job is left; only for use in kernels.
 
     Args:
-        jobs: From `parallel` or `serial`.
+        jobs: Job counters, passed by `parallel` or `serial`.
         count: Number of jobs, the same in every call of a kernel.
     """
     threads = jobs[0]
@@ -96,8 +94,8 @@ def parallel(
 class Begun:
     """A kernel that runs on the other threads while the calling thread does other work.
 
-    No other code may use the data of the kernel until `end`. With one thread, the kernel runs to
-    its end immediately.
+    No other code may use the data of the kernel until `end` returns. With one thread, the kernel
+    runs to its end immediately.
 
     Args:
         kernel: The kernel, as for `parallel`; its arguments follow.
@@ -168,7 +166,7 @@ class _Call:
                 self.error = error
 
     def end(self) -> None:
-        """Return when the call has finished or is cancelled; this may be called repeatedly."""
+        """Return when the call has finished or is cancelled; `end` may be called repeatedly."""
         self._needed = False
         with self._under_way:
             pass
@@ -177,8 +175,8 @@ class _Call:
 class _Helpers:
     """The helper threads of a process, on other cores than the calling thread.
 
-    Linux starts a woken thread on the core of the waking thread and moves it later to an idle core.
-    This takes longer than most kernels.
+    When a thread wakes another thread, Linux starts the woken thread on the same core and moves it
+    to an idle core later. This takes longer than most kernels.
     """
 
     def __init__(self) -> None:
@@ -190,7 +188,7 @@ class _Helpers:
         atexit.register(self._dismiss)
 
     def ask(self, calls: Sequence[_Call]) -> None:
-        """Give one call to each of as many helper threads as there are calls."""
+        """Give each call to a helper thread of its own."""
         core = current_core()
         if core != self._core:
             self._core = core
@@ -228,6 +226,6 @@ def _helpers(process: int) -> _Helpers:
 
 
 def serial(kernel: Callable[Concatenate[Jobs, P], None], *args: P.args, **kwargs: P.kwargs) -> None:
-    """Run a kernel on this thread only, for little work; the bits are the same."""
+    """Run a kernel on this thread only, for little work; the result has the same bits."""
     (jobs,) = _jobs(1)
     kernel(jobs, *args, **kwargs)

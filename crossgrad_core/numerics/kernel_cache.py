@@ -1,4 +1,4 @@
-"""Disk cache of compiled kernels: files are named by all of their sources and checked before use.
+"""Disk cache of compiled kernels: a file's name depends on all sources of its kernel.
 
 One file contains one kernel for one signature: the SHA-256 of the remaining content, then the key
 and Numba's result. There is no index that two processes could overwrite. A file is written
@@ -209,9 +209,9 @@ def fingerprint(source: Path) -> str:
     """Return the SHA-256 of all files whose constants and functions a kernel in `source` may use.
 
     Numba notices changes of the kernel's own file, but not of files that contain inlined functions.
-    The hash covers all files of the kernel's folder and the files that these import from their own
-    package or from the core. If an imported file is in a folder of kernels, its imports are
-    included as well.
+    The hash covers all files of the kernel's folder. It also covers the files that they import from
+    their own package or from the core. If an imported file is in a folder of kernels, its imports
+    are included as well.
     """
     digest = hashlib.sha256()
     for path in sorted(_sources(source)):
@@ -234,7 +234,7 @@ def _sources(source: Path) -> set[Path]:
 def _imported(path: Path) -> frozenset[Path]:
     """Return the files of modules that a file imports from its own package or from the core.
 
-    The result is cached, because most kernel files share most of their imports.
+    The result is cached, because most kernel files import the same files.
     """
     packages, files = {_CORE, _package_of(path)}, set[Path]()
     for node in ast.walk(ast.parse(path.read_bytes())):

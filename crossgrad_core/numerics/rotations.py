@@ -19,7 +19,7 @@ def matrix_rows(w: T, x: T, y: T, z: T) -> tuple[tuple[T, T, T], ...]:
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
-    """Return rotations [N, 3, 3] of quaternions [N, 4] wxyz; a zero one gives the identity."""
+    """Return rotations [N, 3, 3] of quaternions [N, 4] wxyz; a zero quaternion gives identity."""
     length = quats.norm(dim=-1, keepdim=True)
     return unit_rotation_matrices(quats / torch.where(length > 0, length, 1.0))
 

@@ -1,13 +1,13 @@
 """Vectors of eight or sixteen float32 lanes inside compiled kernels.
 
-Numba leaves vectorisation to LLVM's loop vectoriser, which fails on the compositing loops because
-they carry state. This module makes the vector a type: `Lanes` holds eight float32 numbers and
-`Mask` eight truth values. A kernel that uses these types is SIMD code by construction. Each vector
-uses one AVX register; LLVM splits it on machines with narrower registers. Functions with names that
-end in `_wide` make vectors of sixteen lanes. Such vectors need half the instructions on machines
-with AVX-512, and two instructions each on other machines. All other functions accept vectors of
-both widths. Operations are never reordered, and `fma` fuses on every machine that supports it, so
-the same expression in two kernels gives the same bits.
+Numba leaves vectorisation to LLVM's loop vectoriser, which fails on the compositing loops, because
+each iteration depends on the previous iteration. This module makes the vector a type: `Lanes` holds
+eight float32 numbers and `Mask` eight truth values. A kernel that uses these types is SIMD code by
+construction. Each vector uses one AVX register; LLVM splits it on machines with narrower registers.
+Functions with names that end in `_wide` make vectors of sixteen lanes. Such vectors need half the
+instructions on machines with AVX-512, and two instructions each on other machines. All other
+functions accept vectors of both widths. Operations are never reordered, and `fma` fuses on every
+machine that supports it, so the same expression in two kernels gives the same bits.
 
 Functions exist only inside compiled kernels; `Lanes` and `Mask` are annotations. A kernel that
 needs other lane operations can define them with `emitted` and the helpers of this module.
@@ -185,7 +185,7 @@ def _element(at: Site, array: Any, index: Any, kind: ir.Type) -> Any:
 
 
 def shuffled(at: Site, a: Any, b: Any, order: Sequence[int]) -> Any:
-    """Pick lanes of `a` (from 0 on) and of `b` (after the lanes of `a`)."""
+    """Return chosen lanes of `a` and `b`; lane numbers of `b` follow the numbers of `a`."""
     places = ir.Constant(ir.VectorType(_INT, len(order)), list(order))
     return at.builder.shuffle_vector(a, b, places)
 

@@ -16,7 +16,7 @@ def configure_threads(n: int | None = None) -> int:
 
     Kernels divide their work with `jobs.parallel`. For the `prange` loops of plugins, Numba's
     threading layer is set to OpenMP if it can be loaded, else TBB, else Numba's own "workqueue".
-    The layer is not changed if the environment names one (`NUMBA_THREADING_LAYER`,
+    The layer is not changed if the environment names a layer (`NUMBA_THREADING_LAYER`,
     `NUMBA_THREADING_LAYER_PRIORITY`) or if a parallel kernel has already run. Numba's number of
     threads belongs to the calling thread, so every other thread that runs kernels must also call
     this function. After the call, freed memory stays in the process (`keep_freed_memory`).

@@ -56,7 +56,7 @@ def is_given(config: RunConfig, setting: str) -> bool:
 
 
 def given_settings(config: RunConfig) -> dict[str, Any]:
-    """Return the settings that already have a value; `max_gaussians` may be `auto`."""
+    """Return the settings that already have a value, and always `max_gaussians`."""
     names = (name for name in config.model_fields_set if is_given(config, name))
     given = {name: getattr(config, name) for name in names}
     return given | {"max_gaussians": config.max_gaussians}
@@ -98,7 +98,7 @@ def applied(config: RunConfig, rows: Sequence[Decision], planner: str = "") -> R
         planner: Name of the planner that made the rows; empty if the recipe made them.
 
     Raises:
-        UserError: A row names a setting that does not exist, or gives it a wrong value.
+        UserError: A row names a setting that does not exist, or gives a setting a wrong value.
     """
     update: dict[str, Any] = {RULES: {}, **config.model_dump(exclude_unset=True)}
     for row in sorted(rows, key=lambda row: "." in row.setting):
@@ -122,7 +122,7 @@ def applied(config: RunConfig, rows: Sequence[Decision], planner: str = "") -> R
 
 
 def _settings_of(config: RunConfig, name: str) -> dict[str, Any]:
-    """Return the group of settings, or the component, that gets an option from a decision."""
+    """Return the present options of a component, or of a group of settings, as a mapping."""
     value = getattr(config, name, None)
     return value.model_dump(exclude_unset=True) if isinstance(value, BaseModel) else {"name": AUTO}
 

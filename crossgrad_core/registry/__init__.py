@@ -1,1 +1,1 @@
-"""The installed plugins, the slots that they fill, and the way a run calls them."""
+"""The installed plugins, the slots that they fill, and how a run calls plugins."""

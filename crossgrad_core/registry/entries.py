@@ -1,8 +1,9 @@
 """Plugins by name: listed from package metadata, imported only when a run needs them.
 
 Listing reads entry points and imports no plugin, no torch and no pydantic. Loading never fails
-silently: it raises an error that names the plugin and its distribution if a name is unknown, if two
-distributions offer the name, if the plugin fails to import, or if it has the wrong kind.
+silently. It raises an error if a name is unknown, if two distributions offer the name, if the
+plugin fails to import, or if the plugin has the wrong kind. The error names the plugin and its
+distribution.
 """
 
 import sys
@@ -60,7 +61,7 @@ class Entry:
 
     @property
     def package(self) -> str:
-        """The import package or module that contains its class."""
+        """The import package or module that contains the plugin's class."""
         return self.value.partition(":")[0].partition(".")[0].strip()
 
     @property
@@ -129,8 +130,8 @@ def load(slot: "str | type[Component]", name: str) -> "type[Component]":
         name: Name of the plugin.
 
     Raises:
-        UserError: The name is unknown or ambiguous, the plugin fails to import, or its object is
-            not a complete subclass of the slot's base class, or its methods take other arguments.
+        UserError: The name is unknown or ambiguous; the plugin fails to import; the plugin is not a
+            complete subclass of the slot's base class; or its methods take other arguments.
     """
     return load_entry(find(slot if isinstance(slot, str) else slot.slot, name))
 
@@ -188,7 +189,7 @@ def notes_on(error: BaseException) -> list[str]:
 
 
 def quick_answer(entry: Entry) -> Callable[[Any], Any] | None:
-    """Return a function that answers for a component without an import of its class, or None.
+    """Return a function that answers for a component without importing its class; or None.
 
     A package may announce such a function under the name of its component. The function answers
     like `accepts` of a reader with default options, or like `speed` of a rasterizer.
@@ -248,7 +249,7 @@ def build(slot: "str | type[Component]", name: str, options: Mapping[str, Any]) 
         options: Name of an option -> value.
 
     Raises:
-        UserError: For the reasons of `load`, or an option is unknown, missing or out of bounds.
+        UserError: An option is unknown, missing or out of bounds; see also `load`.
     """
     from pydantic import ValidationError
 
@@ -295,7 +296,7 @@ def plain(component: "Component") -> dict[str, Any]:
 
 @cache
 def _offers(path: tuple[str, ...]) -> dict[str, tuple[Entry, ...]]:  # noqa: ARG001 - cache key
-    """Return slot -> entries; `path` is `sys.path`, so that a changed path is scanned again."""
+    """Return slot -> entries; the argument is `sys.path`, so that a new path is scanned again."""
     from importlib.metadata import entry_points
 
     # One call without a filter, because each call scans every installed distribution.

@@ -9,7 +9,7 @@ CROSSGRAD: Final = "crossgrad"
 
 
 def unmet_requirement(distribution: str) -> str:
-    """Return a distribution's requirement on crossgrad if this version fails it; else empty."""
+    """Return a distribution's requirement on crossgrad if it excludes this version; else empty."""
     if distribution == CROSSGRAD:
         return ""
     from importlib.metadata import PackageNotFoundError, requires

@@ -43,7 +43,7 @@ def wrong_signatures(found: type, base: type) -> tuple[tuple[str, str, str], ...
 
 
 def _takes(given: Signature, expected: Signature, *, whole: bool) -> bool:
-    """Return True if a call with all arguments, or with the required ones only, is possible."""
+    """Return True if a call with all arguments, or with the required arguments, is possible."""
     passed = [p for p in expected.parameters.values() if whole or p.default is Parameter.empty]
     positional = [parameter for parameter in passed if parameter.kind in _POSITIONAL]
     named = {
@@ -75,7 +75,7 @@ def raised_at(error: BaseException, package: str) -> str:
 
 
 def defined_at(thing: object) -> str:
-    """Return the place of the definition of a class or function; empty without a source."""
+    """Return file and line of the definition of a class or function; empty without a source."""
     try:
         return f"{inspect.getsourcefile(thing)}:{inspect.getsourcelines(thing)[1]}"  # type: ignore[arg-type]
     except (TypeError, OSError):

@@ -94,7 +94,7 @@ def _name(annotation: object) -> str:
 
 
 def _inside(annotation: object, part: str) -> tuple[type[BaseModel] | None, object]:
-    """Return the model inside a part, if the part is a model, and the annotation of the part."""
+    """Return `annotation` if it is a model, else None, and the annotation of `part` inside it."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         field = annotation.model_fields.get(part)
         return annotation, field.annotation if field else None

@@ -1,4 +1,4 @@
-"""Runs from Python: the same as `crossgrad run`, but with exceptions instead of exit codes."""
+"""Runs from Python: like `crossgrad run`, but with exceptions instead of exit codes."""
 
 import signal
 from collections.abc import Iterator, Sequence
@@ -73,7 +73,7 @@ def resume(
         UserError: The folder is not a run, the run is finished or in use, an option would change
             the training, or the scene or a package has changed.
         RunFailedError: Training failed; existing results are kept.
-        KeyboardInterrupt: As for `run`.
+        KeyboardInterrupt: See `run`.
     """
     settings = merged(None, options, ())
     with _speaking(quiet=quiet), as_in_a_command():

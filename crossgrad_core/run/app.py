@@ -260,7 +260,7 @@ def new(settings: Mapping[str, Any], way: Way) -> Outcome:
 
 
 def _with_remarks(setup: Setup) -> tuple[Setup, float]:
-    """Return the setup with messages of exposure and initializer, and the seconds spent on them."""
+    """Return the setup with messages of exposure and initializer, and the time in seconds."""
     begun, scene = perf_counter(), setup.scene
     messages = setup.exposure.messages(scene, known_starts(setup))
     messages += setup.selection.initializer.messages(scene)
@@ -466,7 +466,7 @@ def resumed(
 
 
 def _decoded(setup: Setup, way: Way) -> float:
-    """Check that the held-out photos, or all photos, can be decoded; return the seconds."""
+    """Check that the held-out photos, or all photos, can be decoded; return the time in seconds."""
     start = perf_counter()
     keep = fits(setup.scene, setup.config.data.cache_mib)
     views = setup.scene.views if way.check else setup.scene.test_views

@@ -105,7 +105,7 @@ def read_and_check(config: RunConfig, path: Path, *, accept: bool = False) -> tu
             set this.
 
     Raises:
-        UserError: For the reasons of `read_scene`, or because the scene contradicts itself.
+        UserError: The scene contradicts itself; see also `read_scene`.
     """
     scene, name = read_scene(config, path)
     data = config.data
@@ -218,7 +218,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
 
 
 def _photos(config: RunConfig) -> ScaledPhotos | DevicePhotos:
-    """Return the cache of photos, in addition to the photos that were decoded last."""
+    """Return the cache of reduced photos, and on a GPU also the cache of photos in its memory."""
     mib, device = config.data.cache_mib, choose_device(config.device)
     # At half the size, photos use a quarter of the memory.
     scaled = ScaledPhotos(mib // 4)
@@ -240,8 +240,8 @@ def _with_first_degree(config: RunConfig) -> RunConfig:
 def _with_steps(config: RunConfig, views: ViewsPerStepSpec) -> RunConfig:
     """Return the configuration with a length in steps, unless its length is in seconds.
 
-    A limit in views together with seconds is kept: the first steps show whether the seconds suffice
-    for the views.
+    If a length in seconds and a limit in views are set, the limit is kept. The first steps show
+    whether the seconds suffice for the views.
 
     Raises:
         UserError: A single step renders more views than `max_views`.

@@ -120,7 +120,7 @@ def _ends(views: Sequence[View], distances: _Floats, points: int) -> tuple[int, 
 
 
 def _way(share: float, nearer: float) -> float:
-    """Return the share of the line at which the distance is `nearer ** share` times the first."""
+    """Return the position on the line (0 to 1) with `nearer ** share` times the first distance."""
     if abs(nearer - 1.0) < 1e-6:  # noqa: PLR2004 - the limit of the next formula
         return share
     return float((1.0 - nearer**share) / (1.0 - nearer))

@@ -176,7 +176,7 @@ def state_text(state: Mapping[str, Any]) -> str:
 
 
 def digest(state: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a state without its own digest; a round trip through JSON keeps it."""
+    """Return the SHA-256 of a state without its `digest`, equal after a round trip through JSON."""
     rest = {key: value for key, value in state.items() if key != _DIGEST}
     return sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
@@ -230,7 +230,7 @@ def read_state(folder: Path) -> dict[str, Any]:
 
 
 def _check_whole(state: Mapping[str, Any], folder: Path) -> None:
-    """Refuse a state that differs from the written one.
+    """Refuse a state that differs from the state that was written.
 
     Raises:
         UserError: The digest differs, or a part is missing or of another type.
@@ -424,7 +424,10 @@ def _write(final: Path, tensors: dict[str, Tensor], state: Mapping[str, Any]) ->
 
 
 def _drop(folder: Path, keep: Keep, *coming: int) -> bool:
-    """Delete the checkpoints that `keep` drops once `coming` exist; return True if any was."""
+    """Delete the checkpoints that `keep` drops when checkpoints of the steps `coming` exist, too.
+
+    Return True if a checkpoint was deleted.
+    """
     steps = named_checkpoints(folder)
     doomed = [steps[step] for step in keep.drops([*steps, *coming]) if step in steps]
     for checkpoint in doomed:
@@ -433,7 +436,7 @@ def _drop(folder: Path, keep: Keep, *coming: int) -> bool:
 
 
 def load_latest(run: Path) -> Checkpoint:
-    """Read the newest checkpoint of a run; a training run may delete old checkpoints meanwhile.
+    """Read the newest checkpoint of a run, even if the run deletes old checkpoints meanwhile.
 
     Raises:
         UserError: There is no checkpoint, or it is damaged.
@@ -472,7 +475,7 @@ def latest(run: Path) -> Path:
 
 
 def drop_later(run: Path, step: int) -> None:
-    """Delete checkpoints after `step`, because a run resumed there would not reproduce them."""
+    """Delete checkpoints after `step`, because a run resumed at `step` would not reproduce them."""
     for later, folder in named_checkpoints(run / CHECKPOINTS).items():
         if later > step:
             discard(folder)

@@ -36,10 +36,10 @@ class Elsewhere:
 
     Attributes:
         name: Name of the capture.
-        views: The views without the views that the run was trained on.
+        views: The views of the capture, except the views that the run was trained on.
         points: [P, 3] the SfM points of the capture.
         trained: Number of views of the capture that the run was trained on.
-        alike: False if the points are not near the run's points; also True if this is unknown.
+        alike: True if the points are near the run's points, or if this is unknown.
     """
 
     name: str
@@ -95,7 +95,7 @@ def elsewhere(setup: Setup, path: Path) -> Elsewhere:
 
 
 def _reader(setup: Setup, path: Path) -> ComponentChoice:
-    """Return the reader of the other scene: the run's own if it accepts the folder, else auto."""
+    """Return the run's reader if it accepts the folder of the other scene, else `auto`."""
     run_reader, scene = setup.config.reader, setup.config.scene
     if scene is not None and path.resolve() == Path(scene).resolve():
         return run_reader

@@ -85,8 +85,8 @@ def with_decisions(
     decisions like settings of the user.
 
     Raises:
-        UserError: For the reasons of `facts_of`; or there is no planner, a photo cannot be decoded,
-            or the recipe does not decide a setting.
+        UserError: There is no planner, a photo cannot be decoded, or the recipe does not decide a
+            setting; see also `facts_of`.
     """
     if config.seconds is not None:
         # The number of steps for the time budget is planned again, and all settings that depend on
@@ -118,20 +118,20 @@ def table_of(config: RunConfig, scene: Scene, start: int | None = None) -> dict[
         start: Number of primitives at the start, if it is already known.
 
     Raises:
-        UserError: For the reasons of `with_decisions`.
+        UserError: See `with_decisions`.
     """
     rows = decide(config, replace(facts_of(config, scene), start=start))
     return {row.setting: row for row in rows}
 
 
 def redecided(setup: Setup, planned: int, start: int | None = None) -> Setup:
-    """Return the run with the numbers and rules for its newly planned length.
+    """Return the run with numbers and rules decided again for its newly planned length.
 
-    Other components stay the same.
+    All other components stay the same.
 
     Args:
         setup: The run.
-        planned: Number of steps that the run is now planned with.
+        planned: New planned number of steps.
         start: Primitives at the start; None before they are counted.
     """
     numbers = {field.name for field in fields(Numbers)}

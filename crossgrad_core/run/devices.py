@@ -87,7 +87,7 @@ def with_device(config: RunConfig) -> tuple[RunConfig, tuple[str, ...]]:
 
 
 def _rasterizer(config: RunConfig) -> tuple[str, str]:
-    """Return the rasterizer for the GPU, and the reason against the GPU; empty if there is none.
+    """Return the rasterizer for the GPU, and the reason against the GPU (empty if it is used).
 
     A rasterizer that the user did not choose must be faster on the GPU than every rasterizer on the
     CPU.
@@ -117,7 +117,7 @@ def _trained(config: RunConfig) -> tuple[Backbone, Densifier]:
 
 
 def _missing() -> list[str]:
-    """Return what each installed rasterizer needs to run on the GPU, and how to install it."""
+    """Return the missing requirements of rasterizers for the GPU, and how to install them."""
     requirements = []
     for name in entries("rasterizers"):
         try:

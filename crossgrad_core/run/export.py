@@ -33,10 +33,10 @@ class Exported:
             None if no baking was needed.
         views: Number of views on which the file was compared with the live model: the view that it
             was baked for, else the held-out views.
-        psnr: dB, mean over these views for the Gaussians of the file, rendered on black as in
+        psnr: Mean PSNR in dB over these views, for the Gaussians of the file on black, as in
             viewers. None if the live model has the same Gaussians on the same background, or if
             there are no such views.
-        live_psnr: dB, the same mean for the live model on its own background.
+        live_psnr: Mean PSNR in dB over these views, for the live model on its own background.
         background: Name of the live model's background if it is not black; no file stores it.
         notes: Messages for the user about the file.
     """
@@ -51,7 +51,7 @@ class Exported:
 
     @property
     def loss(self) -> float | None:
-        """The loss in dB by baking and by the background that no file stores."""
+        """The loss of PSNR in dB by baking and by the background, which no file stores."""
         if self.psnr is None or self.live_psnr is None:
             return None
         return self.live_psnr - self.psnr

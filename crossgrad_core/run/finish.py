@@ -43,7 +43,7 @@ def reason_of(error: BaseException) -> str:
 
 
 def is_unexpected(error: BaseException) -> bool:
-    """Return True if crossgrad did not write the error's message for its users."""
+    """Return True if crossgrad did not write the message of the error for users."""
     return not isinstance(error, UserError | TrainingFailedError)
 
 
@@ -95,7 +95,7 @@ class RunLoop:
     """A run in progress.
 
     Attributes:
-        setup: The setup; a run that follows the clock replaces it.
+        setup: The setup; a run with a time budget replaces it.
         state: The state; after an exception, the last good state.
         session: The writer of the results.
         log: The run's log.txt.

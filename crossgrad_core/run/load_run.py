@@ -350,7 +350,7 @@ def set_up(
     *,
     looks: bool = False,
 ) -> tuple[Setup, float]:
-    """Return the assembled run, and the seconds of reading the scene and of assembling.
+    """Return the assembled run, and the seconds that reading the scene and assembling took.
 
     Args:
         config: The configuration, with a scene.
@@ -427,7 +427,7 @@ def opened(
 
     Args:
         folder: The run's folder.
-        settings: Only `device`, `threads` and `stop_after` may differ from the run's own.
+        settings: Only `device`, `threads` and `stop_after` may differ from the run's own settings.
         accept_scene: Accept a scene whose photos, masks, points or held-out views have changed.
 
     Raises:
@@ -456,7 +456,7 @@ def continued(
 
     Args:
         folder: The run's folder.
-        settings: Only `device`, `threads` and `stop_after` may differ from the run's own.
+        settings: Only `device`, `threads` and `stop_after` may differ from the run's own settings.
         verbosity: -1 quiet, 0 normal, 1 verbose.
         accept_scene: Accept a scene whose photos, masks or points have changed.
         accept_plugins: Accept other versions of the packages that train the run.
@@ -515,7 +515,7 @@ def _noted(folder: Path, setup: Setup, packages: Packages | None) -> tuple[str, 
 
 
 def _config(folder: Path, settings: Mapping[str, Any]) -> RunConfig:
-    """Return the run's own configuration with the settings that may differ."""
+    """Return the run's own configuration, overridden by the changeable settings in `settings`."""
     frozen = sorted(set(settings) - CHANGEABLE)
     if frozen:
         raise UserError(

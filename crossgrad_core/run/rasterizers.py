@@ -1,4 +1,4 @@
-"""The choice of a rasterizer if the user names none, or if the run's own lacks the device."""
+"""The choice of a rasterizer if none is named, or if a run's own does not support the device."""
 
 import logging
 from collections.abc import Mapping

@@ -155,7 +155,7 @@ def _require_decided_options(config: RunConfig, name: str) -> None:
 
 
 def fitted_backbone(config: RunConfig, scene: Scene) -> tuple[Backbone, tuple[str, ...]]:
-    """Return the backbone of a run, fitted to its scene, and notes on what was left out."""
+    """Return the backbone of a run, fitted to its scene, and notes on the fitted options."""
     backbone = chosen(Backbone, config.backbone)
     return pair(backbone.fitted_to(scene), Backbone, tuple, backbone, "fitted_to")
 
@@ -213,7 +213,7 @@ def _check_form(name: str, form: str) -> None:
 
 
 def _or_default(choice: ComponentChoice | None, name: str) -> ComponentChoice:
-    """Return the choice, with the default name if its name is open."""
+    """Return the component choice; if its name is open, it gets the default name."""
     if choice is None:
         return ComponentChoice(name=name)
     return choice.model_copy(update={"name": name}) if choice.name == AUTO else choice
@@ -249,7 +249,7 @@ def operator_of(config: RunConfig) -> tuple[Operator, str]:
 
 
 def views_per_step_of(config: RunConfig) -> tuple[ViewsPerStepSpec, str]:
-    """Return K over a run, and why it differs from the sampler's default; empty if it does not.
+    """Return K of each step, and why it differs from the sampler's default (empty if it does not).
 
     If no K is set, K is the sampler's default, or the smallest K at which the operator works.
     """

@@ -82,7 +82,7 @@ class Session:
         return self._result[1] if self._result is not None and self._result[0] == step else None
 
     def evaluate(self, setup: Setup, state: TrainState, panels: int = 0) -> None:
-        """Evaluate the held-out views, add a row to metrics.csv, and draw `panels` panels."""
+        """Evaluate the held-out views, add a row to metrics.csv, and draw up to `panels` panels."""
         self._require_folder()
         start = perf_counter()
         writer = None
@@ -109,7 +109,7 @@ class Session:
         setup.hook.crossgrad_evaluation(report=report)
 
     def save(self, setup: Setup, state: TrainState) -> None:
-        """Write a checkpoint unless this step is already saved."""
+        """Write a checkpoint, unless a checkpoint of this step exists."""
         if self._saved_step == state.step:
             return
         self._require_folder()
@@ -123,7 +123,7 @@ class Session:
 
     @property
     def gone(self) -> bool:
-        """True if the folder was moved or removed meanwhile."""
+        """True if the run's folder was moved or removed during the run."""
         return not self.folder.is_dir()
 
     def _require_folder(self) -> None:
@@ -239,7 +239,7 @@ def columns_of(setup: Setup) -> tuple[str, ...]:
 
 
 def view_counts(setup: Setup, result: EvaluationResult | None) -> dict[str, int]:
-    """Return the number of held-out views overall and per regime; if known, of measured views."""
+    """Return the number of held-out views (if known, of measured views), overall and per regime."""
     if result is not None:
         regimes = {regime: means.views for regime, means in result.regimes.items()}
         return {"overall": result.overall.views, **regimes}

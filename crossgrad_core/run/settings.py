@@ -112,7 +112,7 @@ def layered(layers: Sequence[Mapping[str, object]], assignments: Sequence[str] =
 
 
 def with_recipe(settings: Mapping[str, Any]) -> Settings:
-    """Return the settings merged with the settings that their recipe fixes; the given settings win.
+    """Return the settings, with the values that their recipe fixes for settings that are open.
 
     A configuration that a run wrote already contains the fixed settings.
 
@@ -144,7 +144,7 @@ def parsed(settings: Mapping[str, Any]) -> RunConfig:
 
 
 def _flat(layer: Mapping[str, object]) -> Settings:
-    """Return the layer with one entry per setting of a group such as `data`."""
+    """Return the layer with one key for each setting of a group, such as `data.split`."""
     flat: Settings = {}
     for name, value in layer.items():
         if name in GROUPS_OF_SETTINGS and isinstance(value, dict):
@@ -183,7 +183,7 @@ def _places(options: Mapping[str, object]) -> dict[tuple[str, ...], object]:
 
 
 def _rules(option: str, value: object) -> Mapping[str, object]:
-    """Return name of a rule -> its options, or True or False for its use.
+    """Return name of a rule -> its options, True to use it, or False to leave it out.
 
     Raises:
         UserError: A value is not a rule.
@@ -211,7 +211,7 @@ def _overlaid(
     chosen: Mapping[tuple[str, ...], object],
     assigned: Sequence[tuple[tuple[str, ...], object]],
 ) -> Settings:
-    """Return the settings, overridden by the settings that were given later."""
+    """Return the earlier settings, overridden by the settings that were given later."""
     lengths = {*chosen, *(path for path, _ in assigned)} & {*LENGTHS}
     had = {(key,) for key, value in settings.items() if value is not None} & {*LENGTHS}
     if lengths:
@@ -247,7 +247,7 @@ def _named_by_default(settings: Settings) -> Settings:
 
 
 def _with_default_name(key: str, value: object) -> object:
-    """Return the choice with a name; options without a name belong to the default component."""
+    """Return a component choice with a name; without a name, the default component is meant."""
     if key not in CHOICES or not isinstance(value, dict) or "name" in value:
         return value
     default = RunConfig.model_fields[key].default
@@ -274,7 +274,7 @@ def _long_form(key: str, value: object) -> object:
 
 
 def _choice(key: str, value: object) -> object:
-    """Return one choice for `a`; a list of choices for `a+b` or a list."""
+    """Return one component choice for `a`, and a list of choices for `a+b` or for a list."""
     chain = isinstance(value, list | tuple) or (isinstance(value, str) and "+" in value)
     return [_named(key, item) for item in _items(value)] if chain else _named(key, value)
 
@@ -293,14 +293,14 @@ def _items(value: object) -> Iterable[object]:
 
 
 def _with_name(name: str, options: object) -> object:
-    """Return the choice `name` with its options; the validation later refuses invalid options."""
+    """Return the component choice `name` with its options; wrong options are refused later."""
     if options is None:
         return {"name": name}
     return {"name": name, **options} if isinstance(options, dict) else {name: options}
 
 
 def _named(key: str, value: object) -> object:
-    """Return a choice `{"name": ..., option: ...}`; the validation later refuses other values."""
+    """Return a component choice `{"name": ..., option: ...}`; other values are refused later."""
     if isinstance(value, str):
         return {"name": value.strip()}
     kind = value if isinstance(value, type) else type(value)
@@ -308,7 +308,7 @@ def _named(key: str, value: object) -> object:
 
 
 def _component(key: str, kind: type[Component], value: object) -> Settings:
-    """Return the choice of a component given as a class, or as an instance with its options.
+    """Return the choice (name and options) of a component given as a class or as an instance.
 
     Raises:
         UserError: The component belongs to another slot, or no installed package offers it.
@@ -379,7 +379,7 @@ def _is_name(path: tuple[str, ...]) -> bool:
 
 
 def _assign(settings: Settings, path: tuple[str, ...], value: object) -> None:
-    """Set the value at a path; a newly chosen component drops the options of the previous one."""
+    """Set the value at a path. A new component starts without the old component's options."""
     path = (current_name(path[0]), *path[1:])
     key, *rest = path
     if key in CHOICES and rest in ([], ["name"]) and isinstance(value, str | type):
@@ -410,12 +410,12 @@ def _in_list(value: object) -> list[object]:
 
 
 def _links(value: object) -> list[Settings]:
-    """Return the choices in a setting: one component, a chain, or observers."""
+    """Return the component choices in a setting: one component, a chain, or observers."""
     return [choice for choice in _in_list(value) if isinstance(choice, dict)]
 
 
 def _renamed(old: object, new: object) -> object:
-    """Return the new choice; a link with the same name as before keeps its options."""
+    """Return the new choice; components whose names do not change keep their options."""
     renamed = [
         _with_options(_links(old), choice) if isinstance(choice, dict) else choice
         for choice in _in_list(new)
@@ -424,7 +424,7 @@ def _renamed(old: object, new: object) -> object:
 
 
 def _with_options(old: list[Settings], new: Settings) -> Settings:
-    """Return the new link with its old options; options without a name apply to any new link."""
+    """Return the new choice, with the options of an old choice of the same name or of no name."""
     for link in old:
         if link.get("name", new["name"]) == new["name"]:
             return {**link, **new}
@@ -432,9 +432,10 @@ def _with_options(old: list[Settings], new: Settings) -> Settings:
 
 
 def _extended(old: list[object], new: object) -> list[object]:
-    """Return the old list with the new choices; the options of a choice in both lists are merged.
+    """Return the old list extended by the new choices.
 
-    Values that are not choices, and new names that occur twice, are left for the validation.
+    If both lists contain a choice, its options are merged. The validation later refuses values that
+    are not choices, and new names that occur twice.
     """
     extended, names = list(old), [link.get("name") for link in _links(new)]
     named = [(row, link) for row, link in enumerate(old) if isinstance(link, dict)]

@@ -1,6 +1,6 @@
 """A trained run as an object: its metrics, its views, its files.
 
-Metrics are read without torch; torch is imported by methods that render.
+Reading metrics does not import torch; methods that render import torch.
 """
 
 from collections.abc import Sequence
@@ -30,8 +30,8 @@ class Run:
     """A run and its folder.
 
     Properties that read the folder (`metrics`, `summary`) read it again each time, so that a run
-    can be watched while it trains. The scene and the newest checkpoint are loaded when they are
-    first needed, and kept.
+    can be watched while it trains. The scene and the newest checkpoint are loaded at their first
+    use and stay in memory.
 
     Args:
         folder: The run's folder.

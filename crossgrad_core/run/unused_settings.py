@@ -1,4 +1,4 @@
-"""Refusal of settings of a new run that would change nothing, with the reason and a remedy.
+"""Refusal of settings that would change nothing in a new run, with the reason and a remedy.
 
 A resumed run is not checked: its settings were accepted when it began.
 """
@@ -135,7 +135,7 @@ def without_resets(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]
 
 
 def _of_views(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
-    """Yield settings about the views of a step that have no effect."""
+    """Yield the settings on the views of a step that have no effect."""
     densifier, name = setup.densifier, setup.selection.names["densifier"]
     one = setup.selection.views_per_step == 1
     if config.densify_views != "all" and not (densifier.edits and densifier.observes):

@@ -20,10 +20,10 @@ _SMALLEST_SAMPLE = 10
 class Bimodality:
     """Sarle's coefficient of one sample.
 
-    For orientation: the coefficient is 1/3 for a normal distribution, 5/9 for a uniform one, and 1
-    for any distribution on two points. Skewness alone reaches 5/9 (exponential distribution), and
-    the finite-sample form is always below 1: two equally populated points give 0.566 at n = 10 and
-    0.951 at n = 100, so n must be reported with the coefficient.
+    For orientation: the coefficient is 1/3 for a normal distribution, 5/9 for a uniform
+    distribution, and 1 for any distribution on two points. Skewness alone reaches 5/9 (exponential
+    distribution). The finite-sample form is always below 1: two equally populated points give 0.566
+    at n = 10 and 0.951 at n = 100. Therefore, n must be reported with the coefficient.
 
     Attributes:
         sample: Finite-sample form with Fisher's G1 and G2; NaN if undefined.

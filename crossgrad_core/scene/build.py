@@ -175,8 +175,8 @@ def label_by_footprint(
     """Label a view near if its footprint is at least the median of the training views, else far.
 
     The footprint is defined in `contract.scene.footprint`. A view without a footprint uses the
-    footprint of the nearest camera with one. If no view has a footprint, every view gets the label
-    `all`.
+    footprint of the nearest camera that has one. If no view has a footprint, every view gets the
+    label `all`.
 
     Args:
         cameras: Cameras of all views, local frame.

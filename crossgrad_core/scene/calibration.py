@@ -37,7 +37,7 @@ class Calibration:
     Attributes:
         model: COLMAP's name of the model, such as `PINHOLE` or `OPENCV`.
         width: Width of the photos used for calibration, pixels.
-        height: Height of the same photos, pixels.
+        height: Height of the photos used for calibration, pixels.
         params: In COLMAP's order for the model.
     """
 

@@ -1,6 +1,6 @@
 """The fingerprint of a scene, and how two fingerprints differ.
 
-A fingerprint holds the frame, cameras, split, points, and the digests of the scene's files.
+A fingerprint contains the frame, cameras, split, points, and the digests of the scene's files.
 """
 
 import os
@@ -294,7 +294,7 @@ def _files(was: Fingerprint, now: Fingerprint) -> list[Difference]:
 
 
 def _others(was: Fingerprint, now: Fingerprint) -> list[Difference]:
-    """Return differences of files except photos and masks; empty if a run did not record them."""
+    """Return differences of files except photos and masks; empty if no files were recorded."""
     if was.files is None or now.files is None:
         return []
     names = was.files.keys() | now.files.keys()

@@ -60,8 +60,8 @@ def camera_centers(world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
 def make_frame(centers: NDArray[np.float64], points: NDArray[np.float64]) -> Frame:
     """Choose the local frame of a scene (3DGS: centre and extent of the training cameras).
 
-    Outlier cameras are ignored. If all training cameras are at one position, the unit is their
-    median distance to the points, or one input unit if there are no points.
+    Outlier cameras are ignored. If all training cameras are at one position, the unit is the median
+    distance from the cameras to the points, or one input unit if there are no points.
 
     Args:
         centers: [N, 3] centres of the training cameras, input frame; N >= 1.

@@ -33,7 +33,7 @@ class LensReach:
 
     Attributes:
         limits: [A] tangent of the largest angle from the axis before the fold. The directions are
-            spread evenly over the circle, from the right side downwards.
+            spread evenly over the circle; they start at the right side and turn downwards.
         folds: True if the fold is inside the photo in some direction.
         wide: True if the photo covers 90 degrees or more from the axis in some direction.
         box: Smallest and largest x, then y, of the rays inside the photo, at distance 1.
@@ -161,8 +161,8 @@ def _is_inside(pixels: NDArray[np.float64], camera: "pycolmap.Camera") -> NDArra
 def _last_before_fold(pixels: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the last step [A] of each direction [A, N, 2] before the model folds over.
 
-    Before the fold the distance from the centre grows with every step, and neighbouring directions
-    keep their order (the Jacobian's determinant is positive).
+    Before the fold, the distance from the centre grows with every step. The Jacobian's determinant
+    is positive, so that neighbouring directions keep their order.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         radius = np.linalg.norm(pixels - pixels[:, :1], axis=2)

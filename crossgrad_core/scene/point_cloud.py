@@ -86,7 +86,7 @@ NO_POINTS: Final = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8)
 
 
 def read_cloud(path: Path, source: str) -> PointCloud:
-    """Read positions and colours of a PLY, LAS or LAZ file; grey if it has no colours.
+    """Read positions and colours of a PLY, LAS or LAZ file; grey if the file has no colours.
 
     Raises:
         UserError: The file is not a point cloud, or laspy is missing for LAS and LAZ.
@@ -192,7 +192,7 @@ def _require_laspy(path: Path) -> None:
 
 
 def thinned(points: CheckedPoints, most: int) -> tuple[CheckedPoints, list[str]]:
-    """Keep at most `most` of the points, one from each cube of a grid, and return them and a note.
+    """Return at most `most` of the points, one from each cube of a grid, and a note.
 
     The first point of each cube in file order is kept, so that equal input gives equal points.
     """

@@ -52,8 +52,8 @@ def split_views(
     """Split views by the option `split`; there is always at least one training view.
 
     `auto` uses lists or the given split first. If there are none, `auto` holds out each n-th photo
-    of each folder. If only a split by regime holds out two or more photos of some regime, it holds
-    out each n-th photo of each regime.
+    of each folder. If fewer than two photos of a regime would be held out, and a split by regime
+    would hold out two or more, `auto` holds out each n-th photo of each regime instead.
 
     Args:
         names: Names of all usable views.
@@ -93,14 +93,14 @@ def _by_regime(every: Split, names: Sequence[str], options: SceneOptions, label:
 
 
 def _split_every(names: Sequence[str], every: int) -> Split:
-    """Hold out each n-th view by name of each folder."""
+    """Hold out every n-th view of each folder, in the order of names."""
     folders = {name: str(PurePosixPath(name).parent) for name in names}
     how = " in each folder" if len(set(folders.values())) > 1 else ""
     return _split_each(folders, every, how)
 
 
 def _split_stratified(names: Sequence[str], every: int, regimes: Mapping[str, str]) -> Split:
-    """Hold out each n-th view by name of each regime; `regimes` covers all views."""
+    """Hold out every n-th view of each regime, in the order of names; `regimes` has all views."""
     return replace(
         _split_each({name: regimes.get(name, "") for name in names}, every, " in each regime"),
         regimes=regimes,
@@ -108,7 +108,7 @@ def _split_stratified(names: Sequence[str], every: int, regimes: Mapping[str, st
 
 
 def _split_each(groups: Mapping[str, str], every: int, how: str) -> Split:
-    """Hold out each n-th view by name of each group; groups of one view are merged."""
+    """Hold out every n-th view of each group by name; groups of one view are merged."""
     members = defaultdict(list)
     for name in sorted(groups):
         members[groups[name]].append(name)
@@ -195,7 +195,10 @@ def _read_lists(root: Path, names: Sequence[str]) -> tuple[frozenset[str], froze
 
 
 def _read_list(path: Path, views: Sequence[str]) -> frozenset[str] | None:
-    """Read the names in a list, with view names for names that match a view; None if missing."""
+    """Read the names in a list; a name that matches a view becomes the name of the view.
+
+    Return None if the list does not exist.
+    """
     if not path.is_file():
         return None
     try:

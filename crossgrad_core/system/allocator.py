@@ -40,8 +40,8 @@ def use_large_pages() -> None:
     """Request large pages for the heap that is new since the previous call (Linux, glibc).
 
     Steps read and write Gaussians at scattered positions in arrays of many megabytes. With pages of
-    4 KiB, most accesses miss the processor's table of pages (TLB). This is only a request: the
-    system may not support large pages, or may not provide them.
+    4 KiB, most accesses miss the processor's table of pages (TLB). The call is only a request: the
+    system may not support large pages, or may not provide any.
     """
     heap = _heap()
     if heap is not None:

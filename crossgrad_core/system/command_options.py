@@ -88,7 +88,7 @@ class GroupedCommand(TyperCommand):
 
     @override
     def format_options(self, ctx: "Context", formatter: "HelpFormatter") -> None:
-        """Write arguments, groups of options in the order of their declaration, and the rest."""
+        """Write arguments, then groups of options as they were declared, then other options."""
         groups: dict[str, list[tuple[str, str]]] = {"Arguments": []}
         others: list[tuple[str, str]] = []
         for parameter in self.get_params(ctx):

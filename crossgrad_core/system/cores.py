@@ -12,7 +12,7 @@ _CGROUP_LIMIT = Path("/sys/fs/cgroup/cpu.max")
 
 
 def available_cores() -> int:
-    """Return the cores of this process: its affinity, limited by the CPU quota rounded up."""
+    """Return the number of usable cores: the affinity, limited by the CPU quota rounded up."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return max(1, min(cores or 1, _quota(_CGROUP_LIMIT)))
 
@@ -30,7 +30,7 @@ def let_idle_threads_sleep() -> None:
     """Let torch's idle threads sleep, unless the environment already sets a policy.
 
     OpenMP threads otherwise spin for milliseconds on cores that other threads and programs need.
-    This has an effect only before torch is imported.
+    The call has an effect only before torch is imported.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 

@@ -128,7 +128,7 @@ def atomic_file(path: Path, needed: int | None = None) -> Iterator[BinaryIO]:
 
 
 def unfinished_name(path: Path) -> Path:
-    """Return the name of a file until it is complete."""
+    """Return the temporary name of a file that is not complete yet."""
     return path.with_name(f".{path.name}.{os.getpid()}.tmp")
 
 
@@ -168,7 +168,7 @@ def _is_alive(process: int) -> bool:
 def text_bytes(text: str) -> bytes:
     r"""Return a text in UTF-8; bytes of a file name that are not UTF-8 become `\udc80` or similar.
 
-    In JSON and YAML this is an escape that restores the name when it is read.
+    In JSON and YAML, the text `\udc80` is an escape that restores the name when the file is read.
     """
     return text.encode(errors="backslashreplace")
 

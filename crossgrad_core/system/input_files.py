@@ -48,8 +48,7 @@ def read_file(path: Path, weights: Mapping[bytes, int] | None = None, most: int 
         most: Maximum size of the file in bytes; its values may take `GROWS` times as much memory.
 
     Raises:
-        OSError: For the reasons of `open_file`; or the file or its values in memory would be too
-            large.
+        OSError: The file, or its values in memory, would be too large; see also `open_file`.
     """
     with open_file(path) as file:
         size = os.fstat(file.fileno()).st_size

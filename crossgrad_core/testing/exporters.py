@@ -26,7 +26,7 @@ def has_a_suffix(make: Make[Exporter]) -> None:
 
 
 def writes_one_file(make: Make[Exporter]) -> None:
-    """Only the named file is written, with equal bytes for equal Gaussians, which do not change."""
+    """Only the named file is written; equal Gaussians give equal bytes and are not modified."""
     with TemporaryDirectory() as folder:
         first, second = (Path(folder) / name for name in ("a", "b"))
         for path in (first, second):

@@ -229,7 +229,7 @@ def rows_on_demand_are_asked_for(make: Make[Rasterizer]) -> None:
 
 
 def speed_says_where_it_runs(make: Make[Rasterizer]) -> None:
-    """`--rasterizer auto` never selects it for a device that it does not support."""
+    """`--rasterizer auto` never selects the rasterizer for a device that it does not support."""
     rasterizer = make()
     for device in ("cpu", "cuda"):
         speed = rasterizer.speed(device)

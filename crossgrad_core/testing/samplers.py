@@ -46,7 +46,7 @@ def sampler_run(sampler: Sampler, views: int | None = None) -> SamplerRun:
 
 
 def default_views_are_admitted(make: Make[Sampler]) -> None:
-    """The sampler's default K is one that it supports."""
+    """The sampler supports its default K."""
     sampler = make()
     require(
         sampler.view_counts.admits(sampler.resolved_views),

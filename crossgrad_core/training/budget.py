@@ -1,4 +1,4 @@
-"""The number of steps that fit into a time budget: planned by a probe, revised by the clock."""
+"""The number of steps that fit into a time budget: measured at the start, revised later."""
 
 import logging
 from collections.abc import Callable
@@ -45,14 +45,14 @@ class PrimitiveCounts:
 
 
 def cost_of_run(setup: Setup, crowd: PrimitiveCounts, steps: int) -> float:
-    """Return the expected cost of a run of `steps` steps, in full-size views at its start."""
+    """Return the expected cost of a run of `steps` steps; unit: a full-size view at its start."""
     setup = setup.at_length(steps, crowd.start)
     schedule = schedule_for(setup, steps)
     return views_of(setup, schedule, 0, steps) * growth_ahead(setup, crowd, schedule, 0)
 
 
 def cost_ahead(setup: Setup, crowd: PrimitiveCounts, step: int, left: int) -> float:
-    """Return the expected cost of the `left` steps after `step`, in full-size views now."""
+    """Return the expected cost of `left` steps after `step`; unit: a full-size view at `step`."""
     setup = setup.at_length(step + left, crowd.start)
     schedule = setup.schedule.with_length(schedule_for(setup, step + left), step)
     views = views_of(setup, schedule, step, step + left)
@@ -73,7 +73,7 @@ def views_of(setup: Setup, schedule: Schedule, after: int, until: int) -> float:
 
 
 def growth_ahead(setup: Setup, crowd: PrimitiveCounts, schedule: Schedule, step: int) -> float:
-    """Return the mean cost of a view after `step`, relative to its cost with present primitives."""
+    """Return the mean cost of a view after `step`, divided by the present cost of a view."""
     if not setup.densifier.edits:
         return 1.0
     ahead = schedule.edits(step)
@@ -86,7 +86,7 @@ def growth_ahead(setup: Setup, crowd: PrimitiveCounts, schedule: Schedule, step:
 
 
 def _along_curve(setup: Setup, crowd: PrimitiveCounts, schedule: Schedule, step: int) -> float:
-    """Return the same ratio if growth follows the curve to its budget."""
+    """Return the result of `growth_ahead` if growth follows the curve to its budget."""
     cameras = [view.camera for view in setup.train_views]
     # Cost of a view without Gaussians, in units of Gaussians.
     empty = fmean(camera.width * camera.height for camera in cameras) / PIXELS_PER_PRIMITIVE
@@ -120,7 +120,7 @@ SMOOTHING = 0.25
 def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
     """Measure how many steps fit into `seconds` of training by the run's clock.
 
-    Kernels must be compiled already. The probe trains a temporary state and keeps nothing.
+    Kernels must be compiled already. The measurement trains a temporary state, which is discarded.
 
     Returns:
         The number of steps, a note with the evidence, and the run's `pixel_share`.
@@ -159,7 +159,7 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
 
 
 def most_steps(setup: Setup) -> int:
-    """Return the largest number of steps of a run with a time budget, however fast they are."""
+    """Return the largest number of steps of a run with a time budget, even if steps are fast."""
     views = setup.config.max_views
     return _NEVER if views is None else setup.selection.views.steps_of(views)
 
@@ -167,7 +167,8 @@ def most_steps(setup: Setup) -> int:
 def _probed(setup: Setup, state: TrainState, seconds: float) -> tuple[int, float]:
     """Return the number of measured steps and the training seconds per view.
 
-    The probe repeats the next `PROBE_STEPS` steps, because later steps may render more pixels.
+    The measurement repeats the next `PROBE_STEPS` steps, because later steps may render more
+    pixels.
 
     If a kernel is compiled, the measurement restarts. The number of restarts is limited, because a
     plugin may compile in every step.

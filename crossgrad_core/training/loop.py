@@ -63,7 +63,7 @@ class Stopper:
         return self.signal is not None or self.error is not None
 
     def fail(self, error: Exception) -> None:
-        """Request the end of the run after its step because of an error in any thread."""
+        """Request the end of the run after the present step, because any thread raised an error."""
         self.error = error
 
     @contextmanager
@@ -87,7 +87,7 @@ class Stopper:
 
     @contextmanager
     def interruptible(self) -> Iterator[None]:
-        """Let a second signal raise KeyboardInterrupt in the block; elsewhere it is only noted."""
+        """Let a second signal raise KeyboardInterrupt in the block; outside, only record it."""
         self._interruptible = not self.at_once
         try:
             yield
@@ -119,7 +119,7 @@ _VIEWS, _STEPS = 8, 2
 
 
 class Prefetcher:
-    """A prefetcher of photos: draws future views with copies of the sampler's stream and state.
+    """A prefetcher of photos: copies of the sampler's generator and state draw future views.
 
     The prediction only decides which photos are decoded first. The prediction may be wrong for a
     sampler that uses the losses of the previous step. The state of the run is not changed.
@@ -154,7 +154,7 @@ class Prefetcher:
         setup.photos_ahead.expect(wanted)
 
     def _follow(self, state: TrainState) -> None:
-        """Drop the prediction of the last step, and all predictions if this one was wrong."""
+        """Drop the prediction of the last step; if it was wrong, drop all predictions."""
         if self._draws and self._step - len(self._draws) == state.step - 1:
             drawn = self._draws.popleft()
             if state.last is not None and state.last.views == drawn:
@@ -222,10 +222,10 @@ def train(
     each call creates a new guard.
 
     Raises:
-        TrainingFailedError: A value was not finite for the second time, or at the start; the
-            message names step, views and block.
-        BaseException: An error of a plugin, a photo, the memory or the disk, with the step as a
-            note. After any exception, `state` is the last good state.
+        TrainingFailedError: A value is NaN or infinite at the start, or again after a rollback. The
+            message names the step, the views and the block.
+        BaseException: An error of a plugin, a photo, the memory or the disk. A note on the error
+            names the step. After any exception, `state` is the last good state.
     """
     check_start(state)
     use_large_pages()
@@ -301,7 +301,7 @@ def timed_step(setup: Setup, state: TrainState) -> StepRecord:
 
 
 def _is_good(setup: Setup, state: TrainState, sink: RunWriter, guard: RollbackGuard) -> bool:
-    """Check a state before it is kept; if it is bad, rewind training.
+    """Check a state before it is kept, and rewind training if the state is not finite.
 
     Return True if the state is good.
     """
@@ -337,7 +337,7 @@ def _tell_held_back(setup: Setup, record: StepRecord) -> None:
 
 
 def looks_after(setup: Setup, step: int) -> bool:
-    """Return True if all parameters are checked after this step, such as before a checkpoint."""
+    """Return True if all parameters are checked after this step, as before a checkpoint."""
     return step % CHECK_EVERY == 0 or saves_after(setup, step) or evaluates_after(setup, step)
 
 

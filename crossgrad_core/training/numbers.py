@@ -1,4 +1,4 @@
-"""The decided settings as training reads them: plain values, all of them set."""
+"""The decided settings as training reads them: plain values without open settings."""
 
 from dataclasses import dataclass, fields
 from typing import Literal

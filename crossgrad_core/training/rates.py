@@ -17,7 +17,7 @@ RESTED: Final = 0.5
 
 
 def axes_of(setup: Setup) -> tuple[str, str, str] | None:
-    """Return the tensors of positions, scales and rotations if positions step along axes."""
+    """Return names of the tensors of positions, scales and rotations for steps along axes."""
     return setup.backbone.gaussian_tensors if setup.numbers.position_lr == "per-axis" else None
 
 
@@ -58,7 +58,7 @@ def means_rate_at(setup: Setup, step: int) -> float:
 
 
 def rate_at(setup: Setup, rate: LearningRate, step: int) -> float:
-    """Return a learning rate of the backbone in a step: the scheduled rate times all factors."""
+    """Return a learning rate of the backbone in a step: its scheduled value times all factors."""
     numbers, schedule = setup.numbers, setup.schedule
     factor = numbers.rate_factor * (rate.few_passes if numbers.few_pass_rates else 1.0)
     factor *= rate_factor(setup, rate, step)

@@ -15,7 +15,7 @@ STREAMS = (
 def make_streams(
     seed: int, rewinds: int = 0, names: Iterable[str] = STREAMS
 ) -> dict[str, np.random.Generator]:
-    """Return new generators of a run; `rewinds` changes them after a rewind.
+    """Return new generators of a run; each rewind of training gives different generators.
 
     Args:
         seed: Seed of the run.

@@ -19,8 +19,8 @@ _Size = tuple[int, int]
 class ScaledPhotos:
     """A cache of reduced photos: for each view, the last requested size and its source.
 
-    The source is the photo after as many halvings as leave it at least as large as the requested
-    size. If the size changes from step to step, most of the work is done once.
+    The source is the smallest halved copy of the photo that is not smaller than the requested size.
+    If the size changes from step to step, most of the work is done once.
 
     Args:
         mib: Memory in MiB; photos that do not fit are computed again.

@@ -151,7 +151,7 @@ class Setup:
         photos_ahead: The threads that decode photos in parallel with the steps.
         decisions: The table of decided settings.
         decide: Makes the table for another length; a run that repeats another run decides nothing.
-        revised: Settings that changed because the clock changed the length of the run.
+        revised: Settings that changed because a time budget changed the length of the run.
         pixel_share: Share of the time of a full-size step that is proportional to its pixels, as
             measured.
     """
@@ -174,7 +174,7 @@ class Setup:
 
     @cached_property
     def in_force(self) -> RunConfig:
-        """The configuration, including the settings that the clock changed."""
+        """The configuration, including the settings that changed with the length of the run."""
         return self.config.model_copy(update=dict(self.revised))
 
     @cached_property

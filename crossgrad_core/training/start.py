@@ -252,8 +252,8 @@ def _made(setup: Setup, answer: object, method: str) -> Parameters:
 def thinned(scene: Scene, share: float, rng: np.random.Generator) -> Scene:
     """Return the scene with this share of its points, at least one, drawn at random.
 
-    Points that an initializer added, which have sizes, are all kept if they fit, because each of
-    them covers a region without other points.
+    Points with sizes come from an initializer. All of these points are kept if they fit, because
+    each of them covers a region without other points.
     """
     count = len(scene.points)
     wanted = max(1, round(share * count))

@@ -59,7 +59,7 @@ class Clock:
         phases: Training seconds by phase of the step; their sum is `train`. Work on a GPU or on
             other threads is counted in the phase that waits for it.
         cpu: CPU seconds of the process during training, for all threads. Work of other threads
-            between two steps is not included if this clock is not the budget.
+            between two steps is included only if the run has a budget in CPU seconds.
     """
 
     train: float = 0.0
@@ -95,7 +95,7 @@ class PhaseTimer:
         total: Seconds from the start of the step to the end of the previous phase, without excluded
             seconds.
         spent: Phase -> seconds.
-        cpu: CPU seconds of the process in the same time, without excluded seconds.
+        cpu: CPU seconds of the process during `total`, without excluded CPU seconds.
         cpu_border: CPU time of the process at the end of the previous phase.
     """
 
@@ -117,7 +117,7 @@ class PhaseTimer:
         self.cpu_border = cpu
 
     def leave_out(self, seconds: float, cpu: float) -> None:
-        """Exclude seconds from the present phase, because they belong to another clock.
+        """Exclude seconds from the present phase, because these seconds belong to another clock.
 
         Args:
             seconds: Wall-clock seconds.
@@ -151,7 +151,8 @@ class TrainState:
     Attributes:
         tensors: The parameters as stored in memory. Some rows may have deferred Adam steps, and a
             step may still run on other threads.
-        moments: The optimizer's moments, under the same conditions.
+        moments: The optimizer's moments as stored in memory. Deferred and running steps may change
+            them, too.
         rngs: Stream name -> generator of the stream.
         states: Plugin name -> its state.
         step: Number of steps, including the present one.
@@ -256,7 +257,7 @@ class TrainState:
 
 
 def unsavable(new: PluginState, device: str, known: PluginState = EMPTY_STATE) -> str:
-    """Return what a checkpoint cannot store of a state; empty if it can store everything.
+    """Return the part of a state that a checkpoint cannot store; empty if there is none.
 
     For speed in each step, only names that are not in the state `known` are checked.
     """
@@ -371,7 +372,7 @@ class StepSnapshot:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """A copy of the last good state, to go back to."""
+    """A copy of the last good state, for a rollback."""
 
     parameters: Parameters
     adam: AdamState

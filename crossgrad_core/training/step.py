@@ -355,7 +355,7 @@ def sample_context(setup: Setup, state: TrainState, step: int) -> SampleContext:
 
 
 def check_largest_draw(setup: Setup) -> None:
-    """Check that the sampler can draw the largest K of the run, which test steps may not use.
+    """Check that the sampler can draw the largest K of the run, because trial steps may not use it.
 
     Raises:
         UserError: The sampler cannot draw this many views.

@@ -18,7 +18,7 @@ Corner = tuple[int, int]
 
 
 def stride_of(scale: float, camera: Camera) -> int:
-    """Return n for a scale 1 / n; 1 if the scale has another form or a side is shorter than n."""
+    """Return n for a scale 1 / n; 1 if the scale has another form or an image side is below n."""
     whole = round(1.0 / scale)
     fits = isclose(whole * scale, 1.0) and whole <= min(camera.width, camera.height)
     return whole if fits else 1

@@ -201,7 +201,7 @@ def add_regularization(
     gaussians: Gaussians | None = None,
     view: View | None = None,
 ) -> None:
-    """Add the gradients of all regularisation terms of one view or, if None, of the step."""
+    """Add the gradients of the regularisation terms of a view (None: of the whole step)."""
     context = RegularizeContext(
         **context_fields(setup, state, "regularize"),
         parameters=state.current,
@@ -425,7 +425,7 @@ def _pass_back(decoded: Gaussians, copy: Gaussians) -> None:
 def _with_losses(
     state: TrainState, records: Sequence[ViewRecord], losses: Sequence[Tensor]
 ) -> tuple[ViewRecord, ...]:
-    """Return the records with their losses, which are read together so that the host waits once.
+    """Return the records with their losses; the host reads all losses at once and waits once.
 
     Raises:
         NonFiniteError: A loss is not finite.
@@ -444,7 +444,7 @@ def _render_jointly(
     scales: Sequence[float],
     regular: TensorGradients,
 ) -> tuple[Rendered, Gradients]:
-    """Run one backward pass through the sum of the losses (for comparison; all graphs alive)."""
+    """Run one backward pass through the summed losses, as a reference; all graphs stay alive."""
     _clear(state.tensors)
     drawn = [_draw_view(setup, state, draw, slot, scale) for slot, scale in enumerate(scales)]
     losses = [view.loss.detach() for view in drawn]
@@ -523,7 +523,7 @@ def _compare(
 
 
 def _seen(setup: Setup, state: TrainState, camera: Camera) -> Gaussians:
-    """Return the decoded Gaussians of a view; some tensors are updated when they are rendered."""
+    """Return the decoded Gaussians of a view; some rows are updated only when they are rendered."""
     phase = setup.phase(state.step, training=True)
     tensors = _learning(setup, state)
     answer = setup.backbone.decode(tensors, camera, phase)

@@ -22,23 +22,22 @@ class Backbone(Component):
     """A trained representation: parameters in named blocks, decoded to Gaussians for a camera.
 
     Attributes:
-        default_densifier: Name of the densifier that is used unless the user names another. In
-            short runs of many photos, another densifier replaces the densifier of the published
-            Gaussians.
+        default_densifier: Name of the densifier that is used unless the user names another. A
+            recipe may choose another densifier, for example in short runs of many photos.
         response: How the Gaussians of the backbone fill a pixel.
         plain: True if the backbone decodes to the same plain Gaussians for every camera, so that a
             standard PLY loses nothing.
         sets_dilation: True if the backbone's Gaussians set their own dilation, regardless of the
             rasterizer's dilation.
-        passthrough: Field of the Gaussians -> tensor that `decode` returns unchanged as this field
-            (or omits) and does not read. Then only the rendered rows need to be up to date.
-            Subclasses do not inherit this value.
+        passthrough: Field of the Gaussians -> tensor. `decode` returns the tensor unchanged as this
+            field, or omits the field, and never reads the tensor. Therefore only the rendered rows
+            of the tensor need to be up to date. Subclasses do not inherit this value.
         positions: Name of the tensor [N, 3] of the primitives' positions in the local frame. Before
             the first step and after steps with edits, the primitives are sorted in memory by
             position: all rows of all per-primitive tensors are sorted together, and `prepare` is
-            not called. At the end of a run, rows may be removed in the same way, after calls of
-            `decode` with some rows only (floaters). If the list is empty, rows are moved or removed
-            only by edits.
+            not called. At the end of a run, the rows of floaters may be removed in the same way.
+            Before this, `decode` is called with some of the rows only. If the name is empty, only
+            edits move or remove rows.
         axes: Names of two tensors, if each primitive is one Gaussian at its position: [N, 3]
             logarithms of standard deviations and [N, 4] rotations (wxyz, of any length). Positions
             may then be updated along these axes, and the deviations may be bounded. Empty if
@@ -99,7 +98,7 @@ class Backbone(Component):
         return names is not None and any(names[1] in block.tensors for block in learning)
 
     def fitted_to(self, scene: Scene) -> tuple["Backbone", tuple[str, ...]]:
-        """Return this backbone without options that the scene does not need, and notes about them.
+        """Return this backbone without options that the scene does not need, and notes on it.
 
         Options that the user set are never changed.
         """
@@ -122,8 +121,9 @@ class Backbone(Component):
     def prepare(self, parameters: Parameters, scene: Scene, phase: Phase) -> Parameters:
         """Return the parameters with derived tensors updated.
 
-        This is called before the first step and after every topology edit. A backbone that stores
-        derived tensors without gradient (filters, levels) computes them again in this method.
+        This method is called before the first step and after every topology edit. A backbone that
+        stores derived tensors without gradient (filters, levels) computes them again in this
+        method.
         """
         return parameters
 

@@ -24,8 +24,8 @@ class Densifier(Component):
         reset_options: Options that have an effect only in runs with resets. A subclass that also
             reads one of these inherited options in other runs must change this set.
         observes: True if the densifier collects statistics of the views that the steps render.
-        budgeted: True if growth follows the budget of Gaussians for the length of the run when the
-            user sets no bound.
+        budgeted: True if growth follows a budget of Gaussians that depends on the length of the
+            run, unless the user sets a bound.
     """
 
     slot: ClassVar[str] = "densifiers"

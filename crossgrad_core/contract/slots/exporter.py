@@ -63,11 +63,11 @@ class Exporter(Component):
         return Rounding(np.zeros(3))
 
     def stored(self, gaussians: Gaussians) -> Gaussians:
-        """Return the Gaussians as read back from the file, local frame; by default unchanged."""
+        """Return the Gaussians that the file stores, in the local frame; by default unchanged."""
         return gaussians
 
     def read(self, path: Path, similarity: Similarity) -> Gaussians:
-        """Return the Gaussians in a file of this format as a starting point; by default an error.
+        """Return the Gaussians in a file, to start a run from; by default raise an error.
 
         Args:
             path: The file.
@@ -82,7 +82,7 @@ class Exporter(Component):
         raise _not_read(path)
 
     def sh_degree_of(self, path: Path) -> int:
-        """Return the SH degree of the Gaussians in a file from its header; by default an error.
+        """Return the SH degree that the header of a file gives; by default raise an error.
 
         Raises:
             UserError: The file cannot be read.

@@ -18,8 +18,8 @@ class PerPhoto:
 
     Attributes:
         start: [P, ...] float32, the initial values in the order of `scene.train_views`; or a
-            function that computes them, if this takes long. A resumed run does not call this
-            function.
+            function that computes the values, if the computation takes long. A resumed run does not
+            call this function.
         lr: Learning rate of the parameter.
     """
 
@@ -37,7 +37,8 @@ class Fitted:
 
     Attributes:
         exposure: The exposure that the run uses.
-        name: Name under which this exposure is installed; None if the choice did not change.
+        name: Name under which this exposure is installed; None if the run keeps the configured
+            exposure.
         notes: The decision on the exposure, and the evidence for it.
     """
 
@@ -50,9 +51,9 @@ class Exposure(Component):
     """A model that turns a render into the image that the camera of one photo would have taken.
 
     The parameters of an exposure belong to photos, not to the scene, so operators do not receive
-    their gradients. After each step, each photo of the step takes a separate Adam step with its own
-    step count, for any number of views and every backbone. Then all values are projected.
-    Checkpoints contain the values.
+    their gradients. After each step, the values of each photo in this step are updated by a
+    separate Adam step with its own step count. This holds for any number of views and every
+    backbone. Then the values of all photos are projected. Checkpoints contain the values.
     """
 
     slot: ClassVar[str] = "exposures"
@@ -65,7 +66,7 @@ class Exposure(Component):
         return Fitted(self)
 
     def messages(self, scene: Scene, known: Mapping[str, Tensor]) -> tuple[str, ...]:
-        """Return messages about this exposure and the scene; this is called for new runs only.
+        """Return messages about this exposure and the scene; called for new runs only.
 
         `known` contains the initial values [P, ...] by name if the user gives a file; else it is
         empty.
@@ -88,16 +89,16 @@ class Exposure(Component):
     def project(self, values: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
         """Return all values [P, ...] after a step, projected to their valid range.
 
-        By default unchanged. For example, gains projected to a mean of zero do not change the
-        brightness of the scene.
+        By default the values are returned unchanged. For example, gains projected to a mean of zero
+        do not change the brightness of the scene.
         """
         return values
 
     def shift(self, name: str, values: Tensor, start: Tensor, end: Tensor) -> Tensor:
         """Return the values [P, ...] of a parameter, all changed as from `start` to `end`.
 
-        By default `end - start` is added. Differences between photos are kept at the level of the
-        values in a file.
+        By default `end - start` is added to every value. This moves the values of all photos to the
+        level of the values in a file, and keeps the differences between photos.
         """
         return values + (end - start)
 
@@ -106,8 +107,8 @@ class Exposure(Component):
     ) -> Mapping[str, Tensor]:
         """Return the values of a view that is not used for training, without reading its pixels.
 
-        By default this is the mean over the training photos of its regime, or over all training
-        photos if its regime contains none.
+        By default, each value is the mean over the training photos of the view's regime, or over
+        all training photos if the regime contains none.
 
         Args:
             view: The view.

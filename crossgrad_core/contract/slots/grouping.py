@@ -18,7 +18,7 @@ class GroupingRule:
     """A grouping after its fit to the training cameras of a scene.
 
     Attributes:
-        labels: One label per view, for any views of the scene, in their order.
+        labels: Function from views of the scene to their labels, one per view, in the same order.
         notes: Messages for the user about the fitted rule (its threshold, a fall-back ...).
     """
 
@@ -53,7 +53,7 @@ class GradientProbe(Protocol):
         ...
 
     def gramians(self, views: Sequence[int]) -> NDArray[np.float64]:
-        """Return [B, V, V] float64 Gramians of the gradients of V training views, by position."""
+        """Return [B, V, V] float64 Gramians of the gradients of these V training views."""
         ...
 
 
@@ -63,7 +63,8 @@ class Grouping(Component):
     Attributes:
         labels: Every label that the rule can give, near first; empty if the user's input defines
             the labels.
-        needs_probe: True if the rule reads gradients and cannot label views without a probe.
+        needs_probe: True if the rule reads gradients and cannot label views without a
+            `GradientProbe`.
     """
 
     slot: ClassVar[str] = "groupings"
@@ -87,7 +88,7 @@ class Grouping(Component):
         """
 
     def quantity(self, scene: Scene, views: Sequence[View]) -> Quantity | None:
-        """Return the quantity that the rule splits, so that a run can report a single mode.
+        """Return the quantity that the rule splits; a run reports if it has a single mode.
 
         Args:
             scene: The scene.

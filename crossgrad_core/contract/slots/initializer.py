@@ -53,7 +53,7 @@ class Initializer(Component):
         return ()
 
     def begun(self, scene: Scene) -> Scene:
-        """Return the scene with the new points appended; indices of its own points stay."""
+        """Return the scene with the new points appended; existing points keep their indices."""
         answer = self.more_points(scene)
         if answer is None:
             return scene

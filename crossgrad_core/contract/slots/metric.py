@@ -15,7 +15,7 @@ from crossgrad_core.contract.scene import View
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """A held-out view and its photo, in the form in which results compare them.
+    """A held-out view with the render and the photo that a metric compares.
 
     Metrics must not change any of its contents.
 
@@ -56,4 +56,4 @@ class Metric(Component):
 
     @abstractmethod
     def measure(self, compared: Compared) -> float | None:
-        """Return the figure of one view; None if it is undefined, such as if no pixel counts."""
+        """Return the metric of one view; None if undefined, for example if no pixel counts."""

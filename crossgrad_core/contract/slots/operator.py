@@ -20,15 +20,15 @@ class Operator(Component):
 
     Attributes:
         separate: True if the operator needs the separate gradients of the views. Otherwise the
-            backward passes accumulate into one gradient, with the same bits and without copies.
+            backward passes accumulate one gradient, which has the same bits and needs no copies.
         views: Supported values of K.
         identity_at_one: True if the operator returns the gradient of a single view unchanged. A run
             with K = 1 then reports that the operator does nothing.
         default_grouping: Name of the grouping that is used if the user names none; None if the
             operator needs no labels.
         sparse_rows: True if `aggregate` returns the results of `total` and `combine` unchanged,
-            sparse or dense. A subclass inherits this value only if it keeps `aggregate`; all other
-            subclasses get dense gradients only.
+            sparse or dense. A subclass that overrides `aggregate` does not inherit this value and
+            receives dense gradients, unless it declares the value itself.
     """
 
     slot: ClassVar[str] = "operators"
@@ -55,7 +55,7 @@ class Operator(Component):
         return views == 1 and self.identity_at_one
 
     def needs_more_views(self, views: int) -> bool:
-        """Return True if the operator, or one that it contains, does nothing with `views` views."""
+        """Return True if the operator, or an operator in it, does nothing with `views` views."""
         return self.is_identity(views)
 
     def reads_labels(self) -> bool:

@@ -26,11 +26,12 @@ class Facts:
 
     Attributes:
         device: Torch device type.
-        planned: Steps that the run was planned with; None while only its seconds are known.
-        total: Present number of steps, after the clock made the run longer or shorter.
+        planned: Planned number of steps; None while only the time budget is known.
+        total: Present number of steps. It differs from `planned` if a time budget made the run
+            longer or shorter.
         mode: `scaled` if the published schedule is stretched to the run, else `absolute`.
-        schedule_length: Length that the schedule is written for; None for the length of the run or
-            the published length.
+        schedule_length: Length that the schedule is written for. None stands for the length of the
+            run, or for the published length.
         views_per_step: Views of each step, K.
         views_because: Why K is not the default of the sampler; empty if it is the default.
         photos: Number of training photos.
@@ -67,7 +68,7 @@ class Facts:
 
     @property
     def published(self) -> bool:
-        """True if the schedule uses the published numbers for any length of the run."""
+        """True if the schedule uses the published numbers, whatever the length of the run."""
         return is_published(self.mode, self.schedule_length)
 
     @property
@@ -85,7 +86,7 @@ class Facts:
         return self.planned
 
     def intervals(self) -> list[Decision]:
-        """Return the rows of evaluations and checkpoints, which do not change any result."""
+        """Return the intervals of evaluations and checkpoints as rows; they change no result."""
         steps = self.planned or self.total
         return [
             Decision("eval_every", max(1, steps // 10), "a tenth of the run"),
@@ -94,13 +95,13 @@ class Facts:
 
     @property
     def views(self) -> int | None:
-        """Planned views, which measure the length of the run; None before they are planned."""
+        """Planned number of rendered views; None before the length of the run is planned."""
         steps = self.steps
         return None if steps is None else self.views_per_step.paced(steps).views(steps)
 
     @property
     def short(self) -> bool:
-        """True if the run is shorter than the published runs; True before its length is planned."""
+        """True if the run is shorter than the published runs, or has no planned length yet."""
         return self.views is None or self.views < REFERENCE
 
     def schedule(self, unit: Unit) -> Schedule:
@@ -114,7 +115,7 @@ class Recipe(Component):
 
     Attributes:
         settings: Settings that the recipe fixes before any fact is known, such as the sampler and
-            the length. Settings of the user override them.
+            the length. The user's settings override these settings.
         rasterizer_options: Options that a rasterizer must support to be chosen for this recipe.
     """
 
@@ -128,6 +129,6 @@ class Recipe(Component):
 
 
 def with_rows(rows: Iterable[Decision], others: Sequence[Decision]) -> list[Decision]:
-    """Return `rows` with `others` merged: a row of `others` replaces its setting or is appended."""
+    """Merge rows: a row of `others` replaces the row of its setting in `rows`, or is appended."""
     table = {row.setting: row for row in rows}
     return [*(table | {row.setting: row for row in others}).values()]

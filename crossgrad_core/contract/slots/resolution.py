@@ -47,11 +47,11 @@ class Resolution(Component):
         return self
 
     def messages(self, schedule: Schedule) -> tuple[str, ...]:
-        """Return messages about the scales under this schedule; called again when it changes."""
+        """Return messages about the scales under this schedule; called again for a new schedule."""
         return ()
 
     def pixels(self, schedule: Schedule, step: int) -> float:
-        """Return the pixels rendered in all steps up to and including this one, in full photos.
+        """Return the pixels that all steps up to this step render, in numbers of full photos.
 
         Time budgets use this number for planning. By default all views have their full size.
         """

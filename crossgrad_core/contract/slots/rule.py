@@ -20,9 +20,9 @@ class Rule(Component):
     installed.
 
     Attributes:
-        copies: Maximum number of copies of the parameters in its state, including the copies in the
-            state of the previous step and in the rollback state. Growth leaves memory for these
-            copies.
+        copies: Maximum number of copies of the parameters that the rule's state contains. Copies in
+            the state of the previous step and in the rollback state count as well. Density control
+            leaves memory for these copies.
     """
 
     slot: ClassVar[str] = "rules"

@@ -11,7 +11,7 @@ STATE = "sampler"
 
 
 class Sampler(Component):
-    """A method that chooses the K training views of a step from its state and the last record.
+    """A method that chooses the K views of a step from its state and the record of the last step.
 
     Attributes:
         views: Supported values of K; options of the sampler may change them.
@@ -52,7 +52,10 @@ class Sampler(Component):
 
     @abstractmethod
     def sample(self, context: SampleContext, state: PluginState) -> tuple[ViewSample, PluginState]:
-        """Return the views of this step and the new state; randomness comes from `context.rng`."""
+        """Return the views of this step and the new state.
+
+        Random numbers must come from `context.rng`.
+        """
 
     @hookimpl
     def crossgrad_sample_views(self, context: SampleContext) -> SampleResult:

@@ -135,7 +135,7 @@ def gramians(jobs: Jobs, addresses: Ints, sizes: Ints, table: Ints, partial: Flo
     """Write the Gramian of each chunk in one pass; NaN or infinite if a view is not finite.
 
     Args:
-        jobs: From `share` or `alone`.
+        jobs: Job counters, passed by `parallel` or `serial`.
         addresses: [T, K].
         sizes: [T].
         table: [C, 2] from `chunk_table`.
@@ -152,7 +152,7 @@ def gramians(jobs: Jobs, addresses: Ints, sizes: Ints, table: Ints, partial: Flo
 
 @strict_device
 def _spread(addresses: Ints, rows: Ints, width: int, start: int, length: int, dense: Rows) -> bool:
-    """Fill `dense` [K * CHUNK] with one chunk of each view; return False if no row is in it."""
+    """Fill `dense` [K * CHUNK] with one chunk of each view; return False if it has no row."""
     first = np.searchsorted(rows, start // width)
     end = np.searchsorted(rows, (start + length - 1) // width + 1)
     if first == end:
@@ -173,10 +173,10 @@ def _spread(addresses: Ints, rows: Ints, width: int, start: int, length: int, de
 def spread_gramian(
     jobs: Jobs, addresses: Ints, rows: Ints, width: int, size: int, partial: Floats
 ) -> None:
-    """Write the Gramians of gradients that are zero except in some rows, bit by bit as `gramians`.
+    """Write the Gramians of gradients that are zero except in some rows, bit-equal to `gramians`.
 
     Args:
-        jobs: From `share`.
+        jobs: Job counters, passed by `parallel`.
         addresses: [K] addresses of the values [R * width]; 0 if a view does not touch the tensor.
         rows: [R], sorted.
         width: Elements of a row.
@@ -298,7 +298,7 @@ def _combine_pieces(
     first: int,
     end: int,
 ) -> None:
-    """Compute results in a buffer in fast memory, because they may overwrite one of the rows."""
+    """Compute results in a buffer in fast memory, because the results may overwrite a row."""
     wide = np.empty(PIECE)
     narrow = np.empty(PIECE, np.float32)
     for start in range(first, end, PIECE):
@@ -355,7 +355,7 @@ def combine(
     """Write the weighted sums of all tensors, in one pass over all views.
 
     Args:
-        jobs: From `share` or `alone`.
+        jobs: Job counters, passed by `parallel` or `serial`.
         addresses: [T, K]; 0 leaves the view out.
         weights: [T, K].
         plain: [T], True to add the rows in float32 in the order of the views instead.

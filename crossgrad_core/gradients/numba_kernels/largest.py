@@ -26,7 +26,7 @@ def largest_bits(
     Without its sign, a larger number has larger bits; infinity and NaN have the largest bits.
 
     Args:
-        jobs: From `share`.
+        jobs: Job counters, passed by `parallel`.
         addresses: [T] addresses of float32 arrays.
         sizes: [T] numbers of elements.
         starts: [T + 1] index of the first part of each array. A part contains `PART` elements; the

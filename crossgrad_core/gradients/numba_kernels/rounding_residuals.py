@@ -1,8 +1,8 @@
-"""Gramians with twice the digits of float64, for operators that need them occasionally.
+"""Gramians with twice the digits of float64, for operators that sometimes need more digits.
 
 Products are added one at a time, and the rounding errors of products and sums are added separately
-(Ogita, Rump and Oishi 2005). This is as exact as 106-bit arithmetic and ten times as slow as plain
-sums.
+(Ogita, Rump and Oishi 2005). The results are as exact as with 106-bit arithmetic. The sums are ten
+times as slow as plain sums.
 """
 
 import numpy as np

@@ -40,7 +40,7 @@ def row_gramians(jobs: Jobs, addresses: Ints, widths: Ints, out: Floats) -> None
     """Add the Gramians of the rows of a block of T tensors to `out`.
 
     Args:
-        jobs: From `share`.
+        jobs: Job counters, passed by `parallel`.
         addresses: [T, K]; 0 if a view does not touch the tensor.
         widths: [T] elements per row.
         out: [N, K, K] float64, zero at first.
@@ -77,7 +77,7 @@ def row_combine(jobs: Jobs, addresses: Ints, weights: Floats, out: int, width: i
     """Write sum_k weights[i, k] * row i of view k; a weight of 0 leaves the row out.
 
     Args:
-        jobs: From `share`.
+        jobs: Job counters, passed by `parallel`.
         addresses: [K]; 0 leaves the view out.
         weights: [N, K].
         out: Address of the result; may be the address of a view's gradient.

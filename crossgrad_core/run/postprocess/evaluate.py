@@ -39,7 +39,7 @@ def evaluate(
         on: Another capture of the place; its views are rendered instead of the held-out views.
 
     Raises:
-        UserError: For the reasons of `evaluated`, `evaluated_file` and `evaluated_on`.
+        UserError: See `evaluated`, `evaluated_file` and `evaluated_on`.
     """
     if ply is not None:
         result, gaussians, capture = evaluated_file(folder, ply, how, on)
@@ -68,8 +68,7 @@ def evaluated_on(
         how: The options for opening the run.
 
     Raises:
-        UserError: For the reasons of `elsewhere`; or the folder is not a run, or the run has no
-            checkpoint.
+        UserError: The folder is not a run, or the run has no checkpoint; see also `elsewhere`.
     """
     require_checkpoint(folder)
     with writing_if_possible(folder, "evaluating") as writes:
@@ -123,7 +122,7 @@ def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, To
     """Evaluate the held-out views of a run again, and rewrite per_view.csv.
 
     The results get another file name if the scene has changed, or if summary.json describes another
-    step. The folder is only read if the run is training, if the folder is not writable, or if
+    step. Nothing is written if the run is training, if the folder is not writable, or if
     per_view.csv has values that cannot be measured here.
 
     Raises:

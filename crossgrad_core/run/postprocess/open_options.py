@@ -1,4 +1,4 @@
-"""Ways of opening a trained run."""
+"""Options for opening a trained run."""
 
 from dataclasses import dataclass
 from pathlib import Path

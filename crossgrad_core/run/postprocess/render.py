@@ -35,7 +35,7 @@ def render(
     how: Opens = AS_IT_IS,
     on: Path | None = None,
 ) -> None:
-    """Render photo, render and error of the views of a run, or of another capture of its place.
+    """Draw photo, render and error of views of a run, or of another capture of its place.
 
     Args:
         folder: The run's folder.
@@ -95,9 +95,9 @@ def render_path(
         how: The options for opening the run.
 
     Raises:
-        UserError: For the reasons of `camera_path`; or the folder is not a run, the run has no
-            checkpoint, the run is training and `out` is not given, `out` already contains a video
-            or such frames, or `frames` is given for a path from a file.
+        UserError: See `camera_path`. Also if the folder is not a run, the run has no checkpoint,
+            the run is training and `out` is not given, `out` already contains a video or such
+            frames, or `frames` is given for a path from a file.
     """
     if frames is not None and path != ZOOM:
         raise UserError(

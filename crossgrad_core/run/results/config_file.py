@@ -24,7 +24,7 @@ NOTES: Final = "notes"
 def write_config(folder: Path, config: RunConfig, notes: Sequence[str] = ()) -> None:
     """Write the configuration that repeats the run, and its first notes.
 
-    A run that follows the clock rewrites the file.
+    A run whose length changes with its time budget rewrites the file.
     """
     # This setting applies to one start only.
     config = config.model_copy(update={"stop_after": None})

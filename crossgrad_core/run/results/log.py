@@ -52,30 +52,30 @@ class Pace:
         )
 
     def with_length(self, total: int) -> "Pace":
-        """Return the figures of a run that now has `total` steps."""
+        """Return the statistics of a run that now has `total` steps."""
         planned = self.total if self.planned is None else self.planned
         return replace(self, total=total, planned=planned)
 
     def evaluated(self, report: EvaluationReport) -> "Pace":
-        """Return the figures after an evaluation."""
+        """Return the statistics after an evaluation."""
         psnr = report.row.get("psnr")
         return replace(self, psnr=float(psnr)) if isinstance(psnr, int | float) else self
 
     @property
     def steps_per_second(self) -> float | None:
-        """Steps per training second, None while unknown."""
+        """Steps per training second; None while unknown."""
         return 1.0 / self.seconds if self.seconds else None
 
     @property
     def seconds_left(self) -> float | None:
-        """Training seconds until the end at the present rate, None while unknown."""
+        """Training seconds until the end at the present speed; None while unknown."""
         if self.record is None or not self.seconds:
             return None
         return (self.total - self.record.step) * self.seconds
 
 
 def progress_line(pace: Pace) -> str:
-    """Return step, share, loss, PSNR, primitives, rate and time left; empty before step 1."""
+    """Return step, share, loss, PSNR, primitives, speed and time left; empty before step 1."""
     record = pace.record
     if record is None:
         return ""

@@ -28,7 +28,7 @@ _NUMBERS, _PASSES = 1 << 16, 8
 
 @dataclass(frozen=True)
 class Calibration:
-    """The rate of a fixed workload on one thread.
+    """The measured speed of a fixed workload on one thread.
 
     Attributes:
         seconds: Duration of the calibration.

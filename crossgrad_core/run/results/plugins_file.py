@@ -66,7 +66,7 @@ def write_plugins(folder: Path, packages: Packages) -> None:
 
 
 def read_plugins(folder: Path, *, quiet: bool = False) -> Packages | None:
-    """Return the packages that trained a run; None, with a note unless `quiet`, if unknown."""
+    """Return the packages that trained a run; if unknown, None, with a note unless `quiet`."""
     path = folder / FILE
     try:
         return _PACKAGES.validate_json(read_file(path))
@@ -91,7 +91,7 @@ def with_present(known: Packages | None, present: Packages) -> Packages:
 
 
 def history(packages: Packages) -> tuple[str, ...]:
-    """Return a note on each package of which several versions trained the run."""
+    """Return a note on each package if several versions of it trained the run."""
     return tuple(
         (
             f"trained with {name} {', then '.join(package.versions)} "
@@ -144,7 +144,7 @@ def refuse_missing(
 
 
 def changes(packages: Packages | None) -> dict[str, str]:
-    """Return the packages whose version differs from the version that trained last: then -> now."""
+    """Return old version -> new version of each package that changed since the last training."""
     changed = {}
     for name, package in (packages or {}).items():
         was = f"{name} {package.versions[-1]}"

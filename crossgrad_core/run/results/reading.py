@@ -1,6 +1,6 @@
 """Reading of a run's results for comparisons: configuration, metrics.csv, summary.json, views.
 
-The module does not import torch, so that a table of many runs appears at once.
+The module does not import torch, so that a table of many runs appears without delay.
 """
 
 from collections.abc import Mapping

@@ -46,7 +46,7 @@ def write_scene(folder: Path, fingerprint: Fingerprint) -> None:
 
 
 def read_scene_file(folder: Path) -> Fingerprint | None:
-    """Return the scene that a run was trained on; None, with a note, if it is unknown."""
+    """Return the fingerprint of the scene that trained a run; if unknown, None, with a note."""
     path = folder / FILE
     why = f"{path} is damaged, or another version wrote it"
     try:

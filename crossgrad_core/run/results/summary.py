@@ -35,7 +35,7 @@ class Summary:
         scene: Name of the scene.
         totals: Steps, views, backward passes, training seconds, primitives, memory.
         result: The last evaluation; None if there was none.
-        rows: All rows of metrics.csv, among which the best is found.
+        rows: All rows of metrics.csv; the best evaluation is found in them.
         seconds: Wall-clock seconds by activity; training seconds also by phase.
         config: The resolved configuration as plain data, including the seed.
         environment: Machine and versions.
@@ -178,7 +178,7 @@ def final_table(result: EvaluationResult | None, totals: Totals) -> str:
 
 
 def metric_lines(result: EvaluationResult) -> list[str]:
-    """Return the metrics overall and per regime, and the reason for each missing one."""
+    """Return the metrics overall and per regime, and the reason for each missing metric."""
     reasons = (f"no {metric}: {reason}" for metric, reason in _shown(result))
     return [*_aligned(_rows(result)), *reasons]
 
@@ -217,7 +217,7 @@ def _number(value: float | None, form: str) -> str:
 
 
 def _shown(result: EvaluationResult) -> list[tuple[str, str]]:
-    """Return reasons for missing metrics, only for metrics that are reported by regime."""
+    """Return the reasons for missing metrics, for the metrics that are reported by regime."""
     reported_by_regime = [figure.name for figure in result.figures if figure.per_regime]
     return [(name, why) for name, why in result.reasons.items() if name in reported_by_regime]
 

@@ -55,7 +55,7 @@ def drop_frames(folder: Path, count: int) -> None:
 
 
 def video_files(folder: Path) -> tuple[Path, Path]:
-    """Return the paths of the video in a folder of frames: of the encoder, and of Pillow."""
+    """Return the two possible paths of the video in a folder of frames: by ffmpeg, by Pillow."""
     return folder / "video.mp4", folder / "video.webp"
 
 

@@ -45,11 +45,12 @@ _AT_ONCE: Final = 8
 def white_of(deep: Sequence[Path]) -> tuple[int, list[str]]:
     """Return the white value of all 16-bit photos, and a note if it is not 65535.
 
-    All photos share one value, which depends on the brightest pixel of all photos. Photos are kept
-    dark if they use a small part of their range and do not fill the range of a smaller bit depth.
+    All photos share one value, which depends on the brightest pixel of all photos. Photos stay dark
+    if they use only a small part of the 16-bit range and do not fill the range of a smaller bit
+    depth.
 
     Args:
-        deep: The photos. Photos are decoded until one photo is bright enough for 16 bits.
+        deep: The 16-bit photos. They are decoded until one photo is bright enough for 16 bits.
 
     Raises:
         UserError: A photo is damaged.

@@ -60,8 +60,8 @@ class FileNames:
 
     A name matches the file with the same path. If there is no such file, a name matches the file
     with the same base name and the most similar path. Suffix, case and Unicode form may differ. A
-    file in another folder matches only if the name's own folder does not exist; if it exists, the
-    file is missing.
+    file in another folder matches only if the name's own folder does not exist. If the name's own
+    folder exists, the name has no file.
 
     Args:
         names: Paths below the folder, with forward slashes.

@@ -51,7 +51,7 @@ def read_header(path: Path) -> PhotoHeader:
     """Read the header of a photo and check cheaply that the file is not truncated.
 
     Raises:
-        UserError: Not a readable photo, or its end is missing.
+        UserError: The file is not a readable photo, or its end is missing.
     """
     with opened(path, "the photo cannot be read") as image, path.open("rb") as file:
         size = path.stat().st_size

@@ -154,7 +154,7 @@ def pair_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
 
 
 def find_mask_folder(option: Path | None, root: Path) -> Path | None:
-    """Return the mask folder: the option, as given or in the scene; else `<scene>/masks`, if any.
+    """Return the option's folder, as given or in the scene; else `<scene>/masks`, if it exists.
 
     Raises:
         UserError: The folder of the option does not exist.

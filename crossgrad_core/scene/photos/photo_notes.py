@@ -130,7 +130,7 @@ def note_sizes(
 
 
 def note_reductions(sources: Sources) -> list[str]:
-    """Note the number of photos that are so large that they are decoded at a reduced size."""
+    """Note the number of photos that are decoded at a reduced size because of their size."""
     reduced = [s.reduction for s in sources.values() if s.reduction > 1]
     if not reduced:
         return []

@@ -74,8 +74,8 @@ class PhotoStore:
     """A folder of decoded photos of bounded size; several threads and processes may share it.
 
     Entries used since this store was opened are kept. If space is needed, the other entries are
-    deleted, least recently used first. If this does not free enough room, or the disk is full, no
-    more photos are written.
+    deleted, least recently used first. If the deletions do not free enough space, or if the disk is
+    full, no more photos are written.
 
     Args:
         folder: The folder; it is created when the first photo is written.
@@ -93,7 +93,7 @@ class PhotoStore:
         self._open = mib > 0
 
     def holds(self, source: Storable) -> bool | None:
-        """Return True if a file for this photo exists, valid or not; None if it is never cached."""
+        """Return True if this photo has a file, valid or not; None if the photo is never cached."""
         origin = source.origin if self._open else None
         return None if origin is None else self._path(origin).is_file()
 
@@ -183,7 +183,7 @@ def _entries(folder: Path) -> Iterator[tuple[float, int, Path]]:
 
 
 def _packed(decoded: Decoded) -> list[bytes | memoryview]:
-    """Pack an entry: magic, CRC-32 of the rest, pixels, and one bit for each pixel of a mask."""
+    """Pack an entry: magic, CRC-32 of the data, pixels, and one bit for each pixel of a mask."""
     image, mask = decoded
     pixels = image.contiguous().numpy().reshape(-1).data
     bits = b"" if mask is None else np.packbits(mask.numpy()).tobytes()
@@ -194,8 +194,8 @@ def _packed(decoded: Decoded) -> list[bytes | memoryview]:
 def _read(path: Path, width: int, height: int, sound: int | None) -> Decoded | None:
     """Read the photo and mask of an entry; None if the entry is missing or invalid.
 
-    The checksum is not verified if the entry was last used at `sound` [ns], because this takes as
-    long as reading.
+    The checksum is not verified if the entry was last used at `sound` [ns], because a check takes
+    as long as reading.
     """
     head, pixels, bits = len(_MAGIC) + _SUM, 3 * width * height, -(-width * height // 8)
     try:

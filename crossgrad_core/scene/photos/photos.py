@@ -46,12 +46,13 @@ class PhotoSource:
     Attributes:
         path: The photo.
         width: Width of the photo in the pixels that its pose refers to.
-        height: Height of the photo in the same pixels.
+        height: Height of the photo in the pixels that its pose refers to.
         orientation: The EXIF orientation that its pose refers to; 1 for the stored pixel grid.
         mask: The mask file, or None.
         alpha: True if the file may have transparent pixels.
         background: RGB in [0, 1] behind transparent pixels; None if these pixels do not count.
-        distorted: Calibration for the undistortion, in the size above; None for a pinhole camera.
+        distorted: Calibration for the undistortion, for the size `width` x `height`; None for a
+            pinhole camera.
         target: (width, height) as trained.
         reduction: Divisor of the file's width and height during decoding.
         white: The value of white, if the file has 16 bits per channel.
@@ -210,7 +211,7 @@ class PhotoCache(Generic[Key]):
     def get(self, source: Key) -> Decoded:
         """Return the decoded photo and mask of `source`; both are shared and must not be changed.
 
-        If another thread is decoding the photo, this waits only for a short time. The decoding
+        If another thread is decoding the photo, this call waits only for a short time. The decoding
         thread has low priority and may make no progress while other programs use the cores.
         """
         over, waited = Event(), False

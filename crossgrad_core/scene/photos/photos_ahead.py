@@ -170,8 +170,9 @@ def check_photos(views: Sequence[View], *, keep: bool, whole: bool = False) -> N
     Args:
         views: The views.
         keep: True if there is memory to keep the decoded photos.
-        whole: True to decode photos completely even without memory to keep them. Otherwise the
-            files are only tested, JPEG files at an eighth of their size.
+        whole: True to decode all photos completely, even if there is no memory to keep the decoded
+            photos. If False and there is no memory, files are only tested, JPEG files at an eighth
+            of their size.
 
     Raises:
         UserError: Some photos cannot be decoded; the message names them.

@@ -104,7 +104,7 @@ def is_deep(image: "Image") -> bool:
 
 
 def take_lower_bytes(image: "Image") -> None:
-    """Make Pillow decode the lower bytes of a 16-bit colour photo; by default it uses the upper.
+    """Make Pillow decode the lower bytes of a 16-bit colour photo, not the upper bytes.
 
     Pillow has no 16-bit colour modes. The function reads the other byte if the byte order is
     swapped.
@@ -138,7 +138,7 @@ def _check_pixels(image: "Image", path: Path) -> None:
 
 
 def _identified(file: BinaryIO, path: Path) -> "Image":
-    """Open an image like `Image.open`, but without Pillow's pixel limit; ours is checked later."""
+    """Open an image without Pillow's pixel limit; crossgrad checks its own limit later."""
     from PIL import Image
 
     Image.init()

@@ -61,8 +61,9 @@ def check_mask(path: Path, photo: Size, *, may_turn: bool) -> None:
 def choose_reduction(path: Path, header: PhotoHeader, max_size: int | None) -> int:
     """Choose the divisor of each side of a photo during decoding: 1, 2, 4 or 8.
 
-    The divisor is 1 for all photos that can be decoded at once. For larger photos it is the largest
-    divisor that keeps `max_size` pixels on the longest side, or else the smallest possible divisor.
+    The divisor is 1 for all photos that can be decoded at once. For larger photos, it is the
+    largest divisor that leaves `max_size` pixels on the longest side. If there is no such divisor,
+    it is the smallest possible divisor.
 
     Raises:
         UserError: The photo is too large; the message suggests a remedy.

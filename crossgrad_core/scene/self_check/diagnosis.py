@@ -81,12 +81,12 @@ class Diagnosis:
 
     @property
     def repairs(self) -> bool:
-        """True if the change makes photos agree that did not agree before."""
+        """True if the photos agree after the change and did not agree before."""
         return self.after >= LEAST and self.after >= self.before + GAINED
 
 
 def scores(agreement: Agreement, *, tracked: bool) -> Floats:
-    """Return scores [V] in [0, 1]: colour correlation, for tracks times the share in frame."""
+    """Return scores [V] in [0, 1]: colour correlation, with tracks times the share in frame."""
     correlation = np.maximum(np.nan_to_num(agreement.correlation), 0.0)
     if tracked:
         return np.asarray(correlation * np.nan_to_num(agreement.share))
@@ -157,7 +157,7 @@ class Bench:
         return found
 
     def _searched(self, search: Search) -> tuple[float, Trial]:
-        """Search the best numbers: first the given values, then with halved steps around it."""
+        """Search the best numbers: try the given values, then refine the best with halved steps."""
         tried = [self.tried(search.trial(value)) for value in search.values]
         best, score, step = search.values[int(np.argmax(tried))], max(tried), search.step
         for _ in range(_ROUNDS):
@@ -221,7 +221,7 @@ def other_axes() -> Iterator[Trial]:
 
 
 def searches() -> Iterator[Search]:
-    """Yield changes with numbers: factors by their logarithm, then shares of width and height."""
+    """Yield changes with numbers: logarithms of factors, then shares of width and height."""
     for make, most in ((_focal, 5.0), (_scaled, 100.0), (_resized, 10.0)):
         steps = np.arange(-np.log(most), np.log(most), _FACTOR)
         yield Search(steps[:, None], _FACTOR, _by_logarithm(make))

@@ -1,4 +1,4 @@
-"""The verdict on a scene: whether its photos agree with its points, which do not, and why."""
+"""The verdict on a scene: which photos disagree with the points of the scene, and why."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -149,7 +149,7 @@ class _Group:
         evidence: The points for the comparison.
         views: [V] rows of the views.
         agreement: Agreement of the unchanged photos.
-        recolored: True if the points' own colours are useless, so that the photos' colours replace
+        recolored: True if the points' own colours are useless; the photos' colours then replace
             them.
     """
 
@@ -315,7 +315,10 @@ class _Group:
         return tuple(self.views[rows].tolist())
 
     def _in_common(self, rows: Integers) -> tuple[Cause | None, Integers]:
-        """Find a change that repairs most photos, or a turn of some; return it and their rows."""
+        """Find a change that repairs most photos, or a turn that repairs some.
+
+        Return the cause, and the rows of the repaired photos.
+        """
         none = np.zeros(0, dtype=np.int64)
         if not len(rows):
             return None, none
@@ -348,7 +351,7 @@ class _Group:
 
     @property
     def _fitting(self) -> float:
-        """The least score of a photo that fits."""
+        """The lowest score at which a photo counts as fitting."""
         return max(_FITS * self.better, LEAST)
 
     def _fitting_others(self, rows: Integers, candidates: Integers) -> Integers:

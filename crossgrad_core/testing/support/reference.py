@@ -1,8 +1,8 @@
 """Contract checks of rasterizers against rasterizer `torch` in float64, the readable rule set.
 
 Inputs are ordinary Gaussians, off-centre cameras, and Gaussians at the extremes of training. A
-pixel may differ for two reasons: rounding decides whether a few Gaussians are drawn at the edge of
-their footprint, and float32 has a rounding error, which is measured on the reference.
+pixel may differ for two reasons. Rounding decides whether a few Gaussians are drawn at the edge of
+their footprint. In addition, float32 has a rounding error, which is measured on the reference.
 """
 
 from collections.abc import Callable, Iterator, Mapping

@@ -1,7 +1,7 @@
 """Contexts of hooks without a run: parameters, Gaussians, renders on request, view records.
 
-A run updates rows of some tensors only if a hook reads them, so its objects are not plain
-dictionaries and Gaussians.
+A run updates rows of some tensors only if a hook reads the rows. Therefore, the contexts of a run
+do not contain plain dictionaries and plain Gaussians.
 """
 
 from collections.abc import Mapping

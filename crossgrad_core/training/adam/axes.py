@@ -25,8 +25,8 @@ _SAMPLE = 1024
 def step_along_axes(positions: Tensor, steps: Tensor, scales: Tensor, quats: Tensor) -> None:
     """Add steps to positions in place, stretched along the axes of their Gaussians.
 
-    A step keeps its length along an axis of typical length. The typical length is the median, over
-    the Gaussians, of the middle one of their three axis lengths.
+    A step keeps its length along an axis of typical length. Each Gaussian has three axis lengths.
+    The typical length is the median of the middle lengths over all Gaussians.
 
     Args:
         positions: [N, 3].

@@ -52,5 +52,5 @@ class Coefficients:
 
     @property
     def square_floor(self) -> float:
-        """Gradients below this value would give a subnormal contribution to the second moment."""
+        """Smallest gradient whose contribution to the second moment is not subnormal."""
         return sqrt(SMALLEST_NORMAL / (1 - self.beta2))

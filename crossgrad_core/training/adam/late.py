@@ -5,8 +5,8 @@ steps are applied row by row when the row is next rendered, or to all rows when 
 The deferred steps use the same float32 operations in the same order, so the bits are the same as
 without deferral.
 
-Steps run in the background on other threads while this thread continues with serial work. The
-tensor is not read before it is rendered or requested; a reader then waits for the step.
+Steps run in the background on other threads while this thread continues with serial work. Code that
+reads the tensor, for a render or on request, waits until the step is complete.
 """
 
 from dataclasses import dataclass, field
@@ -86,7 +86,7 @@ class Late:
         return frozenset(self._behind).union(self._under_way)
 
     def finish(self, name: str | None = None) -> None:
-        """Wait until no step is running; deferred steps are still deferred afterwards.
+        """Wait until no step is running; deferred steps remain deferred.
 
         Args:
             name: The tensor; None means all tensors.
@@ -153,8 +153,7 @@ class Late:
             name: Name of the tensor.
             param: The tensor.
             adam: Moments and counts.
-            rows: [R] int32 without duplicates; None means all rows, after which no step is
-                deferred.
+            rows: [R] int32 without duplicates; None means all rows; then no step remains deferred.
         """
         self.finish(name)
         behind = self._behind.get(name)

@@ -69,7 +69,7 @@ def _update_chunks(
     """Update all tensors, chunk by chunk.
 
     Args:
-        jobs: From `share`.
+        jobs: Job counters, passed by `parallel`.
         addresses: [T, 4] addresses of each tensor's values, gradient and moments.
         sizes: [T] numbers of elements.
         numbers: [T, 9] coefficients of each tensor's step.
@@ -101,7 +101,7 @@ def _update_chunks(
 
 
 def numbers_of(step: Coefficients) -> Numbers:
-    """Return the coefficients of a step as float32; rates beyond float32 are infinite."""
+    """Return the coefficients of a step as float32; learning rates beyond float32 are infinite."""
     with np.errstate(over="ignore"):  # The check of the parameters reports the effect.
         return (
             np.float32(step.beta1),

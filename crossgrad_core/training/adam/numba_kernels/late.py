@@ -1,4 +1,4 @@
-"""Adam by rows: steps of the rows with a gradient, and many steps at once of rows without one.
+"""Adam by rows: one step of rows with a gradient, or many steps of rows without a gradient.
 
 The bits are the same as with `fused` on a whole tensor. With a gradient of zero, a step is
 
@@ -67,7 +67,7 @@ _TINY, _SMALLEST_NORMAL, _LARGEST = (np.float32(v) for v in (TINY, SMALLEST_NORM
 
 @device
 def _rests(p: Lanes, m: Lanes, v: Lanes, steps: Floats, row: int) -> bool:
-    """Return True if no step from `row` of the table on changes a bit of the eight parameters.
+    """Return True if the steps from `row` of the table on change no bit of the eight parameters.
 
     The ratio |m| / sqrt(v) of the moments decreases with every step while v is a normal number.
     """
@@ -131,7 +131,7 @@ def catch_up(
     """Apply the deferred steps without gradient to rows of a tensor.
 
     Args:
-        jobs: From `share`.
+        jobs: Job counters, passed by `parallel`.
         whole: True to update all rows.
         rows: [R] the rows to update, without duplicates; unused if `whole`.
         width: Elements of a row.
@@ -256,7 +256,7 @@ def update_rows(
     """Apply one step to rows of a tensor with their gradients.
 
     Args:
-        jobs: From `share`.
+        jobs: Job counters, passed by `parallel`.
         rows: [R], sorted and unique; consecutive rows are updated as one piece of memory.
         width: Elements of a row.
         param: [N * width].
@@ -314,7 +314,7 @@ def update_all(
     """Apply one step to all rows of a tensor; rows that are not listed have no gradient.
 
     Args:
-        jobs: From `share`.
+        jobs: Job counters, passed by `parallel`.
         rows: [R], sorted and unique.
         width: Elements of a row.
         param: [N * width].
