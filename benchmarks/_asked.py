@@ -22,7 +22,9 @@ _OTHERWISE: Final = ("exposure_from", "data.init", "plan")
 
 @dataclass(frozen=True)
 class Asked:
-    """The settings that a grid names for an arm on a scene. Other settings may have any value.
+    """The settings that a grid names for an arm on a scene.
+
+    Settings that the grid does not name may have any value.
 
     Attributes:
         config: The configuration.
@@ -55,7 +57,10 @@ class Asked:
         return cls(config, named, bool(LENGTHS & settings.keys()))
 
     def fits(self, run: Run) -> bool:
-        """Return True if a run uses all named settings. Undecided or unknown settings fit."""
+        """Return True if a run uses all named settings.
+
+        A setting that is undecided or unknown counts as a match.
+        """
         return (not self.has_length or self._fits_length(run)) and all(
             asked in {run.settings.get(name, asked), *_LEFT_OPEN}
             for name, asked in self.settings.items()
@@ -100,9 +105,9 @@ def asked_for(runs: Sequence[Run], asked: Asked, earlier: frozenset[Run]) -> lis
     Args:
         runs: The runs.
         asked: The settings that the grid names.
-        earlier: Runs of earlier grids, by the table of their sweep. If all runs are earlier runs,
-            none of them counts, because the current run has not ended. If a current run exists but
-            does not fit, the table belongs to another grid and is ignored.
+        earlier: Runs of earlier grids, by the table of their sweep. If all runs belong to earlier
+            grids, no run is returned, because the current run has not ended. If a current run
+            exists but does not fit, the table belongs to another grid and is ignored.
     """
     fitting = [run for run in runs if asked.fits(run)]
     current = [run for run in fitting if run not in earlier]

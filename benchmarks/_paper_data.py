@@ -137,7 +137,7 @@ class Claim(Check):
 
     Attributes:
         id: A short name, unique.
-        where: Place of the statement in the paper.
+        where: Section or table of the paper that contains the statement.
         says: The statement.
     """
 
@@ -215,7 +215,7 @@ class Claims(_Part):
     sections: tuple[Section, ...]
 
     def checks(self) -> Iterator[Check]:
-        """Yield all checks."""
+        """Yield the checks of all tables and sections."""
         for table in self.tables:
             yield from (row.check("better") for row in table.rows.values())
         for section in self.sections:
@@ -223,7 +223,7 @@ class Claims(_Part):
 
 
 class BestOf(_Part):
-    """A grid whose arms are run with the best methods of other grids.
+    """A grid whose arms are run with the best methods that other grids have measured.
 
     Attributes:
         grid: The grid.

@@ -185,7 +185,7 @@ def _command(check: Check, results: Results) -> str:
 
 
 def _expected(tables: Tables, table: Table, method: str) -> Expected:
-    """Return the relation to the table's reference, by the mean difference of a row."""
+    """Return the relation between a row and the table's reference, from their mean difference."""
     found = _differences(tables, table, method)
     mean = fmean(found.values()) if found else 0.0
     if abs(mean) < _SAME:
@@ -222,7 +222,7 @@ def _figures(tables: Tables, table: str, method: str) -> str:
 
 
 def _second_view(results: Results) -> Iterator[str]:
-    """Yield the gain of the second view on each scene, at equal steps, views and seconds."""
+    """Yield a table that shows the gain of the second view, at equal steps, views and seconds."""
     yield from (
         "## Gain of the second view by scene",
         "",

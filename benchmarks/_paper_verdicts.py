@@ -146,7 +146,7 @@ def paired(
 
 
 def _of_gradients(probe: Probe, results: Results, margin: float) -> Contrast:
-    """Return a figure of the gradients, or its difference to another figure, run by run."""
+    """Return a figure of the gradients, or its difference from another figure, for each run."""
     pairs = []
     for (scene, seed), run in sorted(results.runs.get(probe.arm, {}).items()):
         if probe.scenes and scene not in probe.scenes:

@@ -32,7 +32,7 @@ from crossgrad_plugins.compare.run import Run
 
 @dataclass(frozen=True)
 class Band:
-    """Views of one folder at similar distances.
+    """A band: views of one folder at similar distances.
 
     Attributes:
         folder: The regime of the views.

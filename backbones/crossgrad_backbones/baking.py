@@ -29,9 +29,9 @@ def as_plain(
     dilation)), the ratio of footprints.
 
     The 3-D variances are computed for the camera with the finest pixels at a Gaussian. The opacity
-    is computed for the camera with the largest ratio. Means over the cameras would make Gaussians
-    too thin and too faint if they are near some cameras and far from others. A Gaussian that no
-    camera sees is unchanged.
+    is computed for the camera with the largest ratio. With means over the cameras instead, a
+    Gaussian near some cameras and far from others would be too thin and too faint. A Gaussian that
+    no camera sees is unchanged.
 
     Args:
         gaussians: Gaussians of another response.

@@ -60,7 +60,7 @@ class CautiousKernel(Protocol):
 
 
 def doubted(kernel: CautiousKernel, gramians: Floats, context: OperatorContext) -> Floats:
-    """Return weights of 16 digits, or of 32 digits if the kernel finds them ill-conditioned."""
+    """Return weights of 16 digits, or of 32 digits if the 16-digit weights are ill-conditioned."""
     nothing = np.zeros_like(gramians)
     weights, ill_conditioned = kernel(gramians, nothing, context.present, context.unit, None)
 

@@ -70,7 +70,7 @@ BAKED_CAMERAS = 32
 
 
 def evenly(cameras: Sequence[Camera], most: int) -> list[Camera]:
-    """Return at most `most` of the cameras, evenly spaced in their order."""
+    """Return at most `most` cameras, evenly spaced in their order."""
     count = min(len(cameras), most)
     return [cameras[i * len(cameras) // count] for i in range(count)]
 

@@ -38,7 +38,8 @@ class _Back:
     """Gradient sums over the anchors, and buffers for a stretch of anchors.
 
     Attributes:
-        heads: The heads (opacity, covariance, colour) with a gradient, without gaps.
+        heads: The heads (opacity, covariance, colour) that receive a gradient; they follow one
+            another without a gap.
         features: [Q, F] sum.
         first: Sums of the first layers.
         second: Sums of the second layers of `heads`, concatenated.
@@ -111,7 +112,7 @@ def backward(inputs: Inputs, kept: Kept, given: Gradients) -> Gradients:
     Args:
         inputs: Inputs of the forward pass.
         kept: Values that the forward pass saved.
-        given: Gradients of means, quaternions, scales, opacities and colours; None is zero.
+        given: Gradients of means, quaternions, scales, opacities and colours; None means zero.
 
     Returns:
         Gradients of features, offsets, log scales, weight and bias of the first layers, and of each

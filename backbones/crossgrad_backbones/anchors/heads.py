@@ -147,7 +147,7 @@ class Heads:
 
         Args:
             parameters: The parameters.
-            code: [C] appearance code, or None. The code is equal for all anchors and is added to
+            code: [C] appearance code, or None. The code is the same for all anchors and is added to
                 the bias.
         """
         weights, biases = [], []
@@ -204,7 +204,7 @@ class Seen:
 
     Attributes:
         rows: [A] int64 rows of the anchors, without duplicates.
-        factor: [A] in [0, 1], factor of the opacities of each anchor; None for 1.
+        factor: [A] in [0, 1], factor of the opacities of each anchor; None if all factors are 1.
     """
 
     rows: Tensor
@@ -255,8 +255,8 @@ def activated(
 def product(left: Tensor, right: Tensor) -> Tensor:
     """Return the product [a, b] of left [n, a] transposed and right [n, b]; n % `PANEL` is 0.
 
-    The sum is computed panel by panel. The libraries split one long sum over all threads, so the
-    bits would depend on the number of threads.
+    The sum is computed panel by panel. Matrix libraries split one long sum over all threads, so its
+    rounding depends on the number of threads.
     """
     first, second = (torch.unflatten(matrix, 0, (-1, PANEL)) for matrix in (left, right))
     return torch.bmm(first.transpose(1, 2), second).sum(0)

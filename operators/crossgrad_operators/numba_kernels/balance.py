@@ -72,8 +72,8 @@ def _of_present(
 def _graded(norms: Pairs, cosines: Pairs, exact: Exact) -> Pairs:
     """Return D C D [n, n], where D contains the norms divided by the largest norm.
 
-    The matrix has the rank of C. The eigenvalues of the matrix itself would not show this rank at
-    large norm ratios.
+    The matrix has the rank of C. At large norm ratios, the eigenvalues of the Gramian itself would
+    not show this rank.
     """
     n = len(norms)
     longest, _ = longest_of(norms)
@@ -228,10 +228,10 @@ def bargain(cosines: Floats, beta: Floats) -> bool:
 
     Return False if the iteration diverges.
 
-    The objective 1/2 beta^T C beta - sum log beta is self-concordant, so steps of
-    1 / (1 + decrement) converge from any start. In units of beta the Hessian is 1 + B C B, so no
-    damped step removes a whole beta. If a sum of directions with non-negative weights is zero, beta
-    grows without limit.
+    The objective 1/2 beta^T C beta - sum log beta is self-concordant, so steps of 1 / (1 +
+    decrement) converge from any start. In units of beta the Hessian is 1 + B C B, so a damped step
+    never makes a component of beta zero. If a sum of directions with non-negative weights is zero,
+    beta grows without limit.
 
     Args:
         cosines: [n, n].

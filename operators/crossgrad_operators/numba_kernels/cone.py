@@ -1,4 +1,4 @@
-"""Projection onto the cone of directions that conflict with no gradient (UPGrad, DualProj)."""
+"""Projection onto the cone of directions without a conflict (UPGrad, DualProj)."""
 
 import numpy as np
 

@@ -163,11 +163,11 @@ def _limits(search: Search) -> tuple[float, float]:
 
 @strict_device
 def _change(problem: Polyhedron, count: int, search: Search, level: Pair, ridge: float) -> Pair:
-    """Return the level change that moves the nearest point on the active face to distance rho.
+    """Return the change of level that moves the nearest point on the active face to distance rho.
 
     With the slope a = C^-1 r of the multipliers, the squared distance is a quadratic function of
-    the change. The change is infinite if no constraint is active, or if the rounding error of huge
-    multipliers exceeds the distance.
+    the change. The change is infinite if no constraint is active, or if huge multipliers have a
+    rounding error larger than the distance.
     """
     exact, slope = problem.rounding.exact, problem.step
     substitute(problem, count, search.r, slope)
@@ -200,7 +200,7 @@ def _is_beyond_reach(problem: Polyhedron, search: Search) -> bool:
 
 @strict_device
 def _repeats(problem: Polyhedron, before: Flags) -> bool:
-    """Return True if the active constraints equal the last stored ones, and store them."""
+    """Return True if the active constraints equal the stored constraints; store the active ones."""
     same = True
     for k in range(before.size):
         same &= before[k] == problem.active[k]
@@ -255,7 +255,7 @@ def _reach(problem: Polyhedron, search: Search) -> None:
 
 @strict_section
 def _defined(problem: Polyhedron, search: Search) -> float:
-    """Return the share of CAGrad's direction that is defined, and keep the multipliers.
+    """Return the share of CAGrad's direction that is defined, and leave the multipliers unchanged.
 
     The direction is undefined if 0 is a convex combination of the gradients, so that no level above
     0 can be reached, and if level 0 is within the distance. In this case many directions are
@@ -286,7 +286,7 @@ def _cagrad_pair(n1: float, n2: float, cosine: float, c: float) -> tuple[float, 
     """Return the weight of g_1 in g_w, |g_w| and |g_0| (g_0 the mean of both), for 1 = n1 >= n2.
 
     The objective (a - b) x / 2 + c |g_0| sqrt(D (x - x_0)^2 + h^2) is convex in x. Sums of squares
-    are arranged so that only the cosine itself can cancel. The returned weight belongs to the
+    are arranged so that only the cosine itself can cancel. The function returns the weight of the
     longer gradient, because this weight may be tiny.
     """
     product = n1 * n2

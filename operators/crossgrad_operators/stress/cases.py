@@ -1,4 +1,4 @@
-"""Inputs of the suite: K gradients that are short enough for exact sums, or periodic."""
+"""Inputs of the suite. K gradients that are short enough for exact sums, or periodic."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -80,7 +80,7 @@ class Facts:
 
     @cached_property
     def distance(self) -> float:
-        """Distance of zero from the convex hull of the directions g_k / |g_k|.
+        """Distance from the origin to the convex hull of the directions g_k / |g_k|.
 
         Raises:
             UnprovenError: The nearest point of the hull was not found.
@@ -129,7 +129,7 @@ def pairwise_bound(facts: Facts) -> float:
 
 
 def views_bound(facts: Facts) -> float:
-    """Return one per view, at least 8, because sums of equal signs never become shorter."""
+    """Return one unit per view, at least 8, because sums of equal signs never become shorter."""
     return max(PROMISED, float(len(facts.norms)))
 
 
@@ -144,14 +144,14 @@ def determined(facts: Facts) -> bool:
 
 
 def clear(facts: Facts) -> bool:
-    """Return True if `determined` holds, and directions are dependent exactly or not nearly."""
+    """Return True if `determined` holds, and directions are exactly dependent or far from it."""
     return determined(facts) and not _any_between(
         [*facts.sines, *facts.dependence], DEPENDENT, INDEPENDENT
     )
 
 
 def independent(facts: Facts) -> bool:
-    """Return True if `determined` holds, and more than two directions are not nearly dependent."""
+    """Return True if `determined` holds and no more than two directions are nearly dependent."""
     several = len(facts.norms) > 2  # noqa: PLR2004
     return determined(facts) and not (
         several and _any_between(facts.dependence, DEPENDENT, REGULAR)
@@ -164,7 +164,7 @@ def comparable(facts: Facts) -> bool:
 
 
 def hull_apart(facts: Facts) -> bool:
-    """Return True if zero is not near the hull of the directions."""
+    """Return True if the hull of the directions is not near the origin."""
     return facts.distance >= APART
 
 

@@ -315,7 +315,7 @@ def _found(
 
 
 def _change(cosine: Matrix, y: Vector, r: Vector, gap: Number) -> Number | None:
-    """Return the level change that closes the gap of the squared distance on the active face."""
+    """Return the change of level that closes the gap of the squared distance on the active face."""
     mp = require_mpmath().mp
     support = [k for k, v in enumerate(y) if v > 0]
     a = solve(cosine, support, r) if support else None

@@ -139,9 +139,9 @@ def renamed(arms: Sequence[Arm], names: Sequence[str]) -> tuple[Arm, ...]:
 def _varying(runs: Iterable[Run]) -> tuple[str, ...]:
     """Return the settings with several values within a scene, the most important settings first.
 
-    A setting that only some runs have is ignored. Such a setting is either an option of a component
-    that the other runs do not use, so that the component itself differs, or belongs to another
-    version.
+    A setting that only some runs have is ignored. Such a setting either belongs to another version,
+    or is an option of a component that only some runs use; the component itself then distinguishes
+    the arms.
     """
     seen: dict[tuple[str, str], set[str]] = {}
     for run in runs:
@@ -242,9 +242,9 @@ class Cells:
         """Return arm -> scene and seed -> the run that represents them.
 
         The run has the length that is most frequent on its scene; of two equally frequent lengths,
-        the longer one is used. An arm uses another length if it has more than twice as many runs of
-        that length there. An arm without a run of the most frequent length uses its own lengths;
-        the longest run represents each scene and seed.
+        the longer one is used. An arm uses another length on a scene if it has more than twice as
+        many runs of that other length there. An arm without a run of the most frequent length uses
+        its own lengths; the longest run represents each scene and seed.
         """
         chosen = self._chosen()
         return {

@@ -58,7 +58,7 @@ class Comparison:
 
     @property
     def quantity(self) -> Quantity:
-        """The main figure."""
+        """The main metric."""
         return self.quantities[0]
 
     @cached_property
@@ -78,7 +78,7 @@ class Comparison:
 
     @cached_property
     def standing(self) -> Mapping[str, Mapping[str, Standing]]:
-        """Arm -> scene -> the main figure at the end."""
+        """Arm -> scene -> the main metric at the end of the runs."""
         return ranking.standings(self.main, self.quantity)
 
     @cached_property
@@ -93,7 +93,7 @@ class Comparison:
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
-        """Notes on figures and costs that are not compared, with the reason."""
+        """Notes on metrics and costs that are not compared, with the reason."""
         return (*self.checked, *_without(self.main, self.quantity))
 
     @cached_property
@@ -254,7 +254,7 @@ def _check_baseline(arms: Sequence[Arm], baseline: str | None) -> None:
 
 
 def _without(main: Mapping[str, Runs], quantity: Quantity) -> list[str]:
-    """Return notes on runs without a figure at their ends."""
+    """Return notes on runs that have no metric value at their ends."""
     notes = []
     for run in {run.name: run for by in main.values() for run in by.values()}.values():
         if run.final(quantity.name) is None:

@@ -33,7 +33,7 @@ class Pair:
 
     @property
     def difference(self) -> float:
-        """The first minus the second."""
+        """The value of the first run minus the value of the second run."""
         return self.first - self.second
 
 

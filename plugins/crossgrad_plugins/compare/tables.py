@@ -65,7 +65,7 @@ _ARM: Final = Column("arm", "arm")
 
 
 def standing_table(c: Comparison) -> Table:
-    """Return the arms from the best to the worst, with their figures and differences."""
+    """Return the arms from the best to the worst, with their metrics and differences."""
     reference = c.baseline or c.ranking[0]
     unit = f", {c.quantity.unit}" if c.quantity.unit else ""
     return Table(

@@ -102,8 +102,8 @@ def ratios(rows: Sequence[Reached]) -> dict[str, list[float]]:
     """Return arm -> its cost on each problem, divided by the smallest cost of all arms.
 
     A problem is a scene and a seed with a run of every arm. A run that never reaches the quality
-    has an infinite ratio and stays in the denominator. The same applies to all runs of a problem
-    that no arm solves.
+    has an infinite ratio and stays in the denominator. All runs of a problem that no arm solves
+    have an infinite ratio, too.
     """
     amounts: dict[str, dict[Problem, float]] = {}
     for row in rows:

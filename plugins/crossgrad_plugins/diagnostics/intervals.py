@@ -155,7 +155,7 @@ def _along_the_true_gap(draws: Resamples, gap: float, floor: float) -> float:
 
     The sample gap d is the true gap plus noise, and the noise is largest in the directions in which
     gradients vary most. With the covariance Sigma of the difference of the means, noise adds
-    tr(Sigma^2), half of the `floor`, to d' Sigma d, and tr(Sigma) to |d|^2. Half of both is
+    tr(Sigma^2), half of the `floor`, to d' Sigma d, and tr(Sigma) to |d|^2. Half of each term is
     subtracted, or less if the whole gap could be noise, because the remainder is itself uncertain
     with a dozen views.
 

@@ -72,7 +72,7 @@ def conflict(
 
 
 def _share(part: NDArray[np.int64], whole: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the quotient; NaN if the whole is empty."""
+    """Return part / whole; NaN if `whole` is 0."""
     return np.where(whole > 0, part / np.maximum(whole, 1), np.nan)
 
 

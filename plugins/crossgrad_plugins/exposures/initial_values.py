@@ -126,7 +126,7 @@ def _reported_by(source: str, names: Sequence[str]) -> Iterable[str]:
 
 
 def outliers(names: Sequence[str], stops: Iterable[float]) -> Iterable[str]:
-    """Yield a message if photos are far from the mean, from each photo's stops."""
+    """Yield a message if the stops of some photos are far from the mean."""
     far = [name for name, stop in zip(names, stops, strict=True) if abs(stop) > _FAR]
     if far:
         yield (

@@ -50,7 +50,7 @@ class Frame3D:
         return np.asarray(self.scale * (points @ self.rotation.T) + self.shift)
 
     def after(self, first: "Frame3D") -> "Frame3D":
-        """Return both similarities as one similarity: first `first`, then this one."""
+        """Return both similarities as one similarity: first `first`, then this similarity."""
         return Frame3D(
             self.rotation @ first.rotation,
             self.points(first.shift[None])[0],

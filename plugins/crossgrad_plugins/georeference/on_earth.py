@@ -24,7 +24,7 @@ _DIRECTIONS = 48
 
 
 def turned(gaussians: Gaussians, means: Tensor, rotation: Tensor) -> Gaussians:
-    """Return Gaussians with other centres [N, 3], each rotated by one rotation [3, 3] float64.
+    """Return Gaussians with new centres [N, 3]; all are rotated by one rotation [3, 3] float64.
 
     A camera that is moved in the same way sees the same image.
     """

@@ -206,8 +206,9 @@ def _best(pairs: Sequence[tuple[int, int]], met: Sequence[Met]) -> list[tuple[in
 def meet(first: Features, second: Features, pixels: float) -> Met:
     """Return the features that two photos have in common, and their triangulated points.
 
-    Both descriptors are the nearest of each other by a clear margin. The point is in front of both
-    cameras. The projection of the point is at most `pixels` from the feature in both photos.
+    Two features match if each descriptor is by a clear margin the nearest of the other. The point
+    is in front of both cameras. The projection of the point is at most `pixels` from the feature in
+    both photos.
     """
     one, other = _matched(first.descriptors, second.descriptors)
     at = first.pixels[one], second.pixels[other]

@@ -39,8 +39,8 @@ def figure_of(name: str, label: str, net: Trunk, entry: str, scaling: str) -> Fi
 class Perceptual(Metric):
     """Learned perceptual similarity (LPIPS 0.1) with weights that the user provides.
 
-    The result is null without a trunk, because no Python package contains one. Nothing is ever
-    downloaded.
+    Without a trunk file, the result is null, because no Python package contains a trunk. Nothing is
+    ever downloaded.
 
     Attributes:
         net: The network.

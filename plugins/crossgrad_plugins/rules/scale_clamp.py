@@ -2,8 +2,8 @@
 
 A rasterizer projects a Gaussian as if the Gaussian were small compared with its distance. A large
 Gaussian beside or behind a camera therefore spreads over the camera's view, and a training photo
-may not show it (docs/floaters.md). If a camera has the Gaussian in its photo, training corrects the
-size without this rule. The rule was developed for crossgrad.
+may not show it (docs/floaters.md). If the camera's own photo shows the Gaussian, training corrects
+the size without this rule. The rule was developed for crossgrad.
 """
 
 from math import log

@@ -42,7 +42,7 @@ _WORDS = "stopping: running runs save a checkpoint first (press again to skip th
 
 @contextmanager
 def noted(stop: Stop) -> Iterator[list[int]]:
-    """Count stop signals inside the block.
+    """Count stop signals inside the `with` block.
 
     Yields:
         The numbers of the received signals; the list grows while the block runs.

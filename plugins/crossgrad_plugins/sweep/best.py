@@ -135,9 +135,10 @@ def _ends(grid: Grid, cells: Iterable[Job], standings: Iterable[Standing]) -> En
 def _best(
     arm_choices: Sequence[Choice], scene: str, ends: Ends, grid: Grid
 ) -> tuple[Choice, list[str]]:
-    """Return the best of an arm's choices on a scene, and notes on excluded choices.
+    """Return the best configuration of an arm on a scene, and notes on excluded configurations.
 
-    All choices are compared on the same seeds, so a choice with a failed run is excluded.
+    All configurations are compared on the same seeds, so a configuration with a failed run is
+    excluded.
     """
     results = [(choice, ends[choice.label, scene]) for choice in arm_choices]
     _check_ended(results, scene, grid)

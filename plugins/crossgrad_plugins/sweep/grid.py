@@ -98,7 +98,7 @@ class Metric(_Part):
     """The metric of the final table.
 
     Attributes:
-        name: A figure of the held-out views, as in summary.json.
+        name: A metric of the held-out views, as in summary.json.
         goal: `maximize` or `minimize`; the default is `maximize`, but `minimize` for LPIPS.
     """
 

@@ -98,14 +98,14 @@ def _standing(job: Job, folder: Path, last: Record | None, *, alive: bool) -> St
 
 
 def figures(standing: Standing) -> dict[str, float]:
-    """Return name -> finite figure of all held-out views of a finished run."""
+    """Return metric -> finite value of all held-out views of a finished run."""
     overall = (standing.summary or {}).get("overall") or {}
     numbers = ((n, v) for n, v in overall.items() if isinstance(v, int | float))
     return {name: float(value) for name, value in numbers if isfinite(value)}
 
 
 def figure(standing: Standing, name: str) -> float | None:
-    """Return a figure of all held-out views of a finished run; None if missing or not finite."""
+    """Return a metric of all held-out views of a finished run; None if missing or not finite."""
     return figures(standing).get(name)
 
 

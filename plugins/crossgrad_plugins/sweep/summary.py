@@ -29,10 +29,10 @@ def listing(cells: Iterable[Job], standings: Iterable[Standing]) -> Iterator[str
 
 
 def table(cells: Sequence[Job], standings: Iterable[Standing], metric: Metric) -> Iterator[str]:
-    """Yield a table of a figure, configurations x scenes: mean and standard deviation over seeds.
+    """Yield a table of a metric, configurations x scenes: mean and standard deviation over seeds.
 
-    An asterisk marks the best mean of each scene. If no finished run has the figure, a line lists
-    the figures that the runs have.
+    An asterisk marks the best mean of each scene. If no finished run has the metric, a line lists
+    the metrics that the runs have.
     """
     all_standings = tuple(standings)
     values = {standing.job.id: figure(standing, metric.name) for standing in all_standings}

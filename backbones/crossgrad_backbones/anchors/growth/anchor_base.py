@@ -149,7 +149,7 @@ class AnchorDensifier(Densifier):
 
     A subclass decides which anchors are added; everything else follows Scaffold-GS. Counters of an
     offset or an anchor are cleared after a decision about it. A rarely seen anchor therefore keeps
-    its counters until it has been seen often enough.
+    its counters until it has been seen often enough for a decision.
     """
 
     tensors: ClassVar[frozenset[str]] = frozenset({"anchors", "offsets", "features", "scales"})

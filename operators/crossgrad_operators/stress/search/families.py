@@ -1,4 +1,4 @@
-"""Batches of short gradients, of kinds for which small solvers often fail."""
+"""Batches of short gradients of the kinds for which small solvers often fail."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -23,7 +23,7 @@ KEPT = 5
 
 @dataclass
 class WorstCases:
-    """Counts and worst cases, updated with every batch.
+    """Counts and worst cases of one operator, updated with every batch.
 
     Attributes:
         operator: Name of the operator.

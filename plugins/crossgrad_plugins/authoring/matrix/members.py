@@ -104,8 +104,8 @@ def combinations_of(members: Members, admits: Admits, *, full: bool) -> Iterator
         members: The components that are combined.
         admits: Called with every requested combination; returns True if it can work.
         full: True for all combinations with a component of the package. False for the fewest
-            combinations in which each of them occurs with every component of the other slots that
-            it can work with.
+            combinations in which every component of the package occurs with every component of
+            other slots that it can work with.
     """
     ours = sorted((SLOTS.index(slot), name) for slot, name in members.own if slot in SLOTS)
     if ours:

@@ -110,7 +110,7 @@ def looks(arms: Sequence[str]) -> dict[str, Look]:
 
 @contextmanager
 def styled() -> Iterator[None]:
-    """Apply the style to figures inside the block; ignore warnings about missing glyphs."""
+    """Apply the style to figures inside the `with` block; ignore warnings about missing glyphs."""
     from matplotlib import rc_context
 
     with rc_context(_RC), warnings.catch_warnings():

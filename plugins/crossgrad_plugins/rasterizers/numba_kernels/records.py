@@ -344,7 +344,7 @@ def analytic_shape(
     within: Rectangle,
     found: NDArray[np.float64],
 ) -> tuple[int, Rectangle, Analytic]:
-    """Return the same as `plain_shape`, for the analytic response."""
+    """Return the values that `plain_shape` returns, for the analytic response."""
     nothing = 0, (1.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     u, v = get(found, MEAN_U, k), get(found, MEAN_V, k)
     a, c, det = get(found, VARIANCE_X, k), get(found, VARIANCE_Y, k), get(found, DETERMINANT, k)

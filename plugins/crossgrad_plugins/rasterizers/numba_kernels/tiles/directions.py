@@ -1,4 +1,4 @@
-"""Gradients of single pixels by a Gaussian's projected mean, and their directions.
+"""Gradients of single pixels with respect to a Gaussian's mean, and their directions.
 
 This is a separate pass after the backward pass, for densifiers that need directions. The pass
 renders the tiles again and sums, per entry and bin, the fields of
@@ -133,8 +133,8 @@ def _spread(
     """Add the gradients of two columns of four pixels to the sums of their bins.
 
     Args:
-        gx: Gradients by the x of the projected mean, px^-1.
-        gy: Gradients by the y of the projected mean, px^-1.
+        gx: Gradients with respect to the x of the projected mean, px^-1.
+        gy: Gradients with respect to the y of the projected mean, px^-1.
         along: Positions along the axis, in standard deviations.
         width: Width of the image, pixels. Directions are in NDC units.
         height: Height of the image, pixels.
