@@ -1,4 +1,4 @@
-"""Evaluate runs on another capture of the same place, and store the figures with their origin."""
+"""Evaluate runs on another capture of the same place, and store metrics with their origin."""
 
 import csv
 import json

@@ -102,7 +102,7 @@ def _chosen(
     dict[str, frozenset[tuple[str, int]]],
     dict[str, tuple[Path, ...]],
 ]:
-    """Return for each arm the requested runs, the failed runs, and the other runs."""
+    """Return for each arm the requested, the failed and the unrequested runs."""
     runs: dict[str, dict[tuple[str, int], Run]] = {}
     failed: dict[str, frozenset[tuple[str, int]]] = {}
     left_out: dict[str, tuple[Path, ...]] = {}

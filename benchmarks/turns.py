@@ -4,12 +4,12 @@
     python benchmarks/turns.py CASE.npz [--rounds N]
 
 Shared machines change their speed within seconds, so two successive runs would compare times of day
-instead of commits. Here both variants exist all the time, but only one of them takes a step at a
-time. With `--beside`, the variants are this checkout and an older checkout with an environment from
-`make install`. Without `--beside`, the variants are one process with two threads, and two
-simultaneous processes with one thread each on their own cores. The output is one JSON line: medians
-of the seconds, and median and quartiles of the quotients by round. The quotient is this checkout's
-seconds over the other checkout's seconds, or the step rate of two threads over the step rate of two
+instead of commits. Here both sides exist all the time, and only one of them takes a step at a time.
+With `--beside`, the sides are this checkout and an older checkout with an environment from `make
+install`. Without `--beside`, the sides are one process with two threads, and two simultaneous
+processes with one thread each on their own cores. The output is one JSON line: medians of the
+seconds, and median and quartiles of the quotients by round. The quotient is this checkout's seconds
+over the other checkout's seconds, or the step rate of two threads over the step rate of two
 processes.
 """
 

@@ -27,7 +27,7 @@ class ColorFit:
 
     Attributes:
         products: [P, k, 4, 4] weighted sums of basis times basis.
-        colors: [P, k, 4, 3] weighted sums of basis times colour, less 1/2.
+        colors: [P, k, 4, 3] weighted sums of basis times (colour - 1/2).
     """
 
     products: Tensor

@@ -184,7 +184,10 @@ def imtl_g(
 def _same_shares(
     norms: Pairs, cosines: Pairs, places: Indices, unit: float, weights: Floats, exact: Exact
 ) -> bool:
-    """Fill in the weights of more than two views, and return True if they are ill-conditioned."""
+    """Fill in the weights of more than two views.
+
+    Return True if these weights are ill-conditioned.
+    """
     n = places.size
     longest, _ = longest_of(norms)
     scaled, v, x = np.empty((n, 2)), np.zeros((n, 2)), np.empty((n, 2))

@@ -159,7 +159,10 @@ def independent(facts: Facts) -> bool:
 
 
 def comparable(facts: Facts) -> bool:
-    """Return True if `clear` holds, and norm ratios are at most 1e8 if zero is in the hull."""
+    """Return True if `clear` holds.
+
+    If the hull of the directions contains the origin, norm ratios must also be at most 1e8.
+    """
     return clear(facts) and (facts.ratio <= COMPARABLE or facts.distance >= APART)
 
 

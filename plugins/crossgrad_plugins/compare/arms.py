@@ -271,7 +271,10 @@ class Cells:
         }
 
     def _chosen(self) -> dict[tuple[str, str], Length]:
-        """Return arm and scene -> the length used there; no entry without the usual length."""
+        """Return arm and scene -> the length used there.
+
+        An arm without a run of the usual length has no entry.
+        """
         scene_counts: dict[str, Counter[Length]] = {}
         arm_counts: dict[tuple[str, str], Counter[Length]] = {}
         for arm, problems in self.runs.items():

@@ -168,7 +168,10 @@ class Comparison:
 
     @cached_property
     def _telling(self) -> list[tuple[str, str]]:
-        """The pairs of arms in every table; with many arms, only the pairs of the best arm."""
+        """The pairs of arms that every table shows.
+
+        With many arms, these are only the pairs of the best arm.
+        """
         couples = pairwise.couples(self.ranking, self.baseline)
         few = self.baseline is not None or len(self.arms) <= _FEW_ARMS
         return couples if few else couples[: len(self.arms) - 1]

@@ -72,7 +72,10 @@ def opposed_text(contrast: Contrast) -> str:
 
 
 def where_text(contrast: Contrast) -> str:
-    """Return the place of a contrast; a star marks runs that were compared before their ends."""
+    """Return the point or the views of a contrast.
+
+    A star marks runs that were compared before their ends.
+    """
     title = _TITLES.get(contrast.where)
     text = contrast.where if title is None else f"equal {title}"
     return f"{text} *" if contrast.inside else text

@@ -110,7 +110,10 @@ def with_pictures(
 
 
 def _runs_of(comparison: Comparison, scene: str) -> list[tuple[str, Run]]:
-    """Return the best arms on a scene, each with its run of the lowest seed that all share."""
+    """Return the best arms on a scene, each with one run.
+
+    All these runs have the lowest seed that the arms share.
+    """
     arms = [
         arm for arm in comparison.ranking if any(at == scene for at, _ in comparison.main[arm])
     ][:MOST_ARMS]

@@ -96,7 +96,10 @@ class Run:
         return value if value is not None and isfinite(value) else None
 
     def series(self, name: str, cost: Cost, regime: str | None = None) -> tuple[Array, Array]:
-        """Return the cost at each evaluation [n], ascending, and the figure at each of them [n]."""
+        """Return the costs [n] and the metric values [n] of the evaluations.
+
+        Costs are ascending.
+        """
         points = self.results.curve(name, regime, over=cost.column)
         values = {x: y for x, y in points if isfinite(x) and isfinite(y)}
         x = np.array(sorted(values), dtype=np.float64)

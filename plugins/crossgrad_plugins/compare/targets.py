@@ -54,7 +54,7 @@ class Reached:
 def targets_of(
     runs: Mapping[str, Runs], quantity: Quantity, given: float | None
 ) -> dict[str, float]:
-    """Return scene -> the quality to reach: the given one, or the median end of the weakest arm.
+    """Return scene -> the quality to reach: given, or the median end of the weakest arm.
 
     With an even number of runs, the worse of the two middle runs counts. More than half of the runs
     reach this quality, so the median of their costs is finite.

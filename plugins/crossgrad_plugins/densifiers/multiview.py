@@ -143,7 +143,10 @@ class MultiViewDensityControl(CountsMarkedPixels, AxisSplit):
         return replace(edit, values=values, counts={**edit.counts, "capped": len(rows)})
 
     def _pruned_late(self, context: DensifyContext, state: PluginState) -> tuple[Edit, PluginState]:
-        """Remove faint primitives and primitives with nearly the largest error, if it is due."""
+        """Remove faint primitives and primitives with nearly the largest error.
+
+        This happens only in steps in which late pruning is due.
+        """
         schedule = context.schedule
         reached = schedule.counted(context.step) / schedule.length
         due = sum(share <= reached for share in self.late_prunings) if schedule.grows else 0

@@ -71,8 +71,8 @@ class StudentisedGap:
     """The resamples of one block and the variance of its noise.
 
     Attributes:
-        draws: The resamples, with the sample itself in row 0; shifts are scaled as along the true
-            gap.
+        draws: The resamples, with the sample itself in row 0; shifts are scaled to their size along
+            the true gap.
         estimate: Unbiased estimate of the gap theta = ||near mean - far mean||^2.
         plain_gap: Squared distance of the sample means.
         floor: Variance of the estimate at theta = 0.
@@ -123,7 +123,10 @@ class StudentisedGap:
         return Pivot(observed, numerators / np.sqrt(_positive(variance[1:] + self.floors)))
 
     def ratio_pivot(self, ratio: float) -> Pivot:
-        """Return the studentised gap - ratio * sigma_w^2 and resamples, if `ratio` is true."""
+        """Return the studentised gap - ratio * sigma_w^2 and its resamples.
+
+        `ratio` is assumed to be the true ratio.
+        """
         draws = self.draws
         gap = ratio * float(draws.within[0])
         root = sqrt(gap)

@@ -75,7 +75,10 @@ def camera_rows(scene: Scene) -> list[Row]:
 
 
 def grouping_rows(scene: Scene, measurement: Measurement, seed: int) -> list[Row]:
-    """Return the same probe by several groupings; give the reason if one cannot group the scene."""
+    """Return rows of one probe for several groupings.
+
+    If a grouping cannot group the scene, its row gives the reason.
+    """
     rows: list[Row] = []
     for name, labels, reason in _groupings(scene, seed):
         if reason:

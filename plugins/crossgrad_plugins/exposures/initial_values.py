@@ -182,7 +182,9 @@ class Neighbours:
         return of_near, of_regime
 
     def tell(self, values: _Floats) -> bool:
-        """Return True if neighbouring photos predict a photo's values better than its regime does.
+        """Return True if neighbouring photos predict a photo's values better than its regime.
+
+        The prediction of a regime is the mean of its values.
 
         With only two photos, return False.
         """

@@ -128,7 +128,10 @@ def _all_of(members: Members, ours: set[tuple[int, str]]) -> Iterator[Row]:
 def _few_of(
     members: Members, slots: tuple[str, ...], ours: list[tuple[int, str]], admits: Admits
 ) -> Iterator[Row]:
-    """Yield combinations in which each component of the package meets all that it works with."""
+    """Yield few combinations.
+
+    Each component of the package occurs with every component that it works with.
+    """
     values = [members.names[slot] for slot in slots[: len(SLOTS)]]
     values += [(name,) for _, name in ours[: len(slots) - len(SLOTS)]]
 

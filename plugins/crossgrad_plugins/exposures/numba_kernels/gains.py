@@ -76,7 +76,11 @@ def _slope(value: np.float32, taken: np.float32, gain: np.float32) -> np.float32
 
 @device
 def _sides(values: Lanes, straight: Lanes, bright: Lanes) -> tuple[np.uint64, np.uint64]:
-    """Return bits of the values in the straight part before and after, and in the power part."""
+    """Return two sets of bits.
+
+    They mark the values that stay in the straight part of the curve, and the values that stay in
+    the power part.
+    """
     dark = splat(_THRESHOLD)
     both = bits(values <= dark) & bits(straight <= dark)
     return both, _ALL & ~bits(values <= dark) & ~bits(bright <= dark)

@@ -159,7 +159,9 @@ def _blend(
     capped: NDArray[np.float32] | None,
     responses: NDArray[np.float32],
 ) -> tuple[Lanes, Lanes, Lanes, Lanes]:
-    """Blend a plain Gaussian into patches; replace alpha by the gradient by the exponent.
+    """Blend a plain Gaussian into patches.
+
+    Replace alpha by the gradient with respect to the exponent.
 
     Returns:
         The sums of the gradients with respect to red, green, blue and the depth.

@@ -201,7 +201,9 @@ def mean_gradients(
     v_depth: NDArray[np.float32] | None,
     analytic: NDArray[np.float32] | None,
 ) -> tuple[Lanes, Lanes]:
-    """Blend a Gaussian into a patch; return the pixels' gradients by the projected mean (x and y).
+    """Blend a Gaussian into a patch; return the gradients of the pixels.
+
+    Each gradient is with respect to x and y of the projected mean.
 
     Gradients of plain records are in units of 2 log 2 px^-1; gradients of analytic records are in
     px^-1.
