@@ -53,7 +53,7 @@ class Reading(_Part):
 
 
 class Probe(_Part):
-    """A figure of the gradients of an arm's runs, or the difference of two figures of these runs.
+    """A statistic of the gradients in an arm's runs, or the difference of two such statistics.
 
     Attributes:
         arm: Name of the arm, which uses the observer `diagnostics`.
@@ -69,7 +69,7 @@ class Probe(_Part):
 
 
 class Arithmetic(_Part):
-    """A statement about figures of the paper's own tables: shares of a gap within bounds.
+    """A statement about the paper's own tables: a method closes a certain share of a gap.
 
     Attributes:
         table: Table that contains `method` and `base`.
@@ -228,7 +228,8 @@ class BestOf(_Part):
     Attributes:
         grid: The grid.
         candidates: Arms from which the best methods are chosen.
-        scaffold_like: Backbone -> tuned arms whose rates it uses, for one view and for more views.
+        scaffold_like: Backbone -> tuned arms whose learning rates the backbone uses, for one view
+            and for more views.
     """
 
     grid: str
@@ -243,7 +244,7 @@ class Plan(_Part):
         tuning: The grid that gives the factors of the learning rates.
         grids: The measured grids, in order.
         rates: Arm -> the tuned arm whose factors it uses. `default` applies to other arms.
-        fixed_rates: Grids whose arms set their own rates.
+        fixed_rates: Grids whose arms set their own learning rates.
         best_of: The grid that depends on the results of the other grids.
     """
 

@@ -414,7 +414,10 @@ def _probe(tables: Sequence[Sequence[Mapping[str, str]]], run: Run) -> Iterator[
 
 
 def _with_interval(row: Mapping[str, str], column: str) -> str:
-    """Return an estimate with its 95 % interval. A negative estimate has no interval above 0."""
+    """Return an estimate with its 95 % interval.
+
+    If the estimate is negative, the text says that there is no interval.
+    """
     value, low, high = (row.get(f"{column}{end}", "") for end in ("", "_low", "_high"))
     # Tables from before 2026-11-25 contain [0, 0] in this case.
     if value and float(value) < 0.0 and not any(float(end) for end in (low, high) if end):

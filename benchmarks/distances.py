@@ -64,7 +64,7 @@ def bands_of(capture: Capture, folders: Sequence[str], count: int) -> list[Band]
 
 @dataclass(frozen=True)
 class Probes:
-    """Figures of runs on views of another capture.
+    """Metric values of runs on views of another capture.
 
     Attributes:
         runs: Arm -> scene and seed -> run.
@@ -131,7 +131,7 @@ class Probes:
 def figures_of(
     runs: Sequence[Run], capture: Capture, name: str, *, file: bool
 ) -> dict[Path, dict[str, float]]:
-    """Return folder of a run -> photo -> figure of its model, or of its PLY drawn on black.
+    """Return folder of a run -> photo -> metric of its model, or of its PLY drawn on black.
 
     Raises:
         UserError: There is no such figure, or a run cannot be evaluated.

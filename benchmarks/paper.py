@@ -76,12 +76,12 @@ class Place:
         return self.out / grid
 
     def grid(self, grid: str) -> Path:
-        """Return the path of the grid that is run, with scenes and rates filled in."""
+        """Return the path of the grid that is run, with scenes and learning rates filled in."""
         return self.out / "grids" / f"{grid}.yaml"
 
     @property
     def tuned(self) -> Path:
-        """The grid with the best rates, as written by `crossgrad sweep --best`."""
+        """The grid with the best learning rates, as written by `crossgrad sweep --best`."""
         return self.out / "grids" / "tuned.yaml"
 
     def archive(self, grid: str) -> Path:
@@ -214,7 +214,7 @@ class Paper:
         }
 
     def _content(self, name: str, factors: Factors) -> dict[str, Any] | None:
-        """Return a grid with rates, or None if it has to wait for other grids."""
+        """Return a grid with learning rates, or None if it has to wait for other grids."""
         grid = self.source(name)
         if name == self.plan.best_of.grid:
             best = self._best(self.results(), self.grids())

@@ -29,7 +29,10 @@ def recall(
 def remember(
     state: PluginState, context: OperatorContext, key: str, values: NDArray[np.float64]
 ) -> PluginState:
-    """Return the state with `values` [B, ...] under `key`. Rows follow their primitives."""
+    """Return the state with `values` [B, ...] under `key`.
+
+    If primitives move to other rows of their tensors, the stored values move with them.
+    """
     tensors, rows_of = dict(state.tensors), dict(state.per_primitive)
     if _by_block(context):
         tensors[key] = torch.from_numpy(values)
@@ -57,6 +60,9 @@ def _by_block(context: OperatorContext) -> bool:
 
 
 def _runs(context: OperatorContext) -> Iterator[tuple[str, int]]:
-    """Yield each block's name and number of Gramians. Above 1, each Gramian is of a primitive."""
+    """Yield each block's name and number of Gramians.
+
+    A number above 1 means one Gramian per primitive.
+    """
     for name, run in groupby(context.blocks):
         yield name, sum(1 for _ in run)

@@ -86,8 +86,9 @@ class Kernel(Protocol):
 def extended_precision(kernel: Kernel, gramians: Floats, context: OperatorContext) -> Floats:
     """Return weights with as many digits as the gradients require.
 
-    Gradients finer than float32 get 32 digits if the residuals of their Gramians are known. Other
-    gradients get 16 digits, and 32 digits if the kernel finds their weights ill-conditioned.
+    Gradients with a type finer than float32 get 32 digits if the residuals of their Gramians are
+    known. Other gradients get 16 digits, and 32 digits if the kernel finds their weights
+    ill-conditioned.
     """
     if context.unit < FLOAT32 and context.rounding_residuals is not None:
         return kernel(gramians, context.rounding_residuals(), context.present, True)[0]

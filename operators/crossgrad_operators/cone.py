@@ -14,8 +14,8 @@ class UPGrad(GramianOperator):
     """The mean of the gradients, each projected onto the cone of conflict-free directions.
 
     For each k: v_k = argmin v^T G v subject to v >= e_k / K; u is the sum of all v_k G. For two
-    views u is half of `symmetric`. Two views use a closed form. More views use the active sets of
-    Lawson and Hanson. Gradients in float64 use 32 digits.
+    views u is half of the result of `symmetric`. Two views use a closed form. More views use the
+    active sets of Lawson and Hanson. Gradients in float64 use 32 digits.
 
     Source: Quinton and Rey 2024, "Jacobian descent for multi-objective optimization".
     """

@@ -138,7 +138,9 @@ def baked(
     views: Sequence[tuple[Camera, Seen]],
     code: Tensor | None = None,
 ) -> Gaussians:
-    """Convert anchors to plain Gaussians: for each anchor the mean over the cameras that see it.
+    """Convert anchors to plain Gaussians.
+
+    The result for an anchor is the mean over the cameras that see the anchor.
 
     Opacities are averaged with 0 for cameras that do not draw a Gaussian. Scales, rotations and
     colours are averaged with the opacities as weights; colours use spherical harmonics up to band

@@ -41,8 +41,8 @@ class _Back:
         heads: The heads (opacity, covariance, colour) that receive a gradient; they follow one
             another without a gap.
         features: [Q, F] sum.
-        first: Sums of the first layers.
-        second: Sums of the second layers of `heads`, concatenated.
+        first: Gradient sums of the first layers.
+        second: Gradient sums of the second layers of `heads`, concatenated.
         raw: [n, outputs of all heads] gradient with respect to the raw outputs.
         hidden: [n, H of all heads] gradient with respect to the hidden layers.
     """
@@ -117,7 +117,7 @@ def backward(inputs: Inputs, kept: Kept, given: Gradients) -> Gradients:
     Returns:
         Gradients of features, offsets, log scales, weight and bias of the first layers, and of each
         second layer. If only the scales have a gradient (volume regularisation), the gradients of
-        the offsets and of the other two networks are None and cost nothing.
+        the offsets and of the other two networks are None and are not computed.
     """
     alone = all((gradient is not None) == (i == _SCALES) for i, gradient in enumerate(given))
     back = _Back.of(inputs, kept, (_COVARIANCE,) if alone else _HEADS)

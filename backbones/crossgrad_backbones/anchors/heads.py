@@ -132,7 +132,7 @@ class Heads:
         return views if any(self.far) else views[:, :DIRECTION]
 
     def mixed(self, parameters: Mapping[str, Tensor], features: Tensor, views: Tensor) -> Tensor:
-        """Mix features [A, F] read at every fourth, second and first index (repeated to F)."""
+        """Mix the features [A, F], read at strides 4, 2 and 1 and repeated to F."""
         first, first_bias, second, second_bias = self.networks[-1].layers(parameters)
         hidden = linear(views, first, first_bias).relu()
         shares = torch.softmax(linear(hidden, second, second_bias), 1)

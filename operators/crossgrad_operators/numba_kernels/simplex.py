@@ -152,7 +152,11 @@ class Search(NamedTuple):
 
 @strict_device
 def _limits(search: Search) -> tuple[float, float]:
-    """Return the levels below which no constraint is active, and at which one is at rho."""
+    """Return two levels.
+
+    Below the first level, no constraint is active. At the second level, one constraint is at
+    distance rho.
+    """
     low, high = np.inf, np.inf
     for k in range(len(search.r)):
         q, r = search.q[k, 0], search.r[k, 0]
@@ -257,8 +261,8 @@ def _reach(problem: Polyhedron, search: Search) -> None:
 def _defined(problem: Polyhedron, search: Search) -> float:
     """Return the share of CAGrad's direction that is defined, and leave the multipliers unchanged.
 
-    The direction is undefined if 0 is a convex combination of the gradients, so that no level above
-    0 can be reached, and if level 0 is within the distance. In this case many directions are
+    The direction is undefined if level 0 is within the distance and 0 is a convex combination of
+    the gradients. In this situation no level above 0 can be reached. Many directions are then
     equally good.
     """
     largest, rho = 0.0, search.rho[0][0]

@@ -119,12 +119,12 @@ class Facts:
 
 
 def default_bound(facts: Facts) -> float:
-    """Return 8, or more if the rounding of the weighted sum plus 2 for the weights exceeds 8."""
+    """Return 8, or the rounding of the weighted sum plus 2 for the weights if this is larger."""
     return max(PROMISED, facts.partial + 2.0)
 
 
 def pairwise_bound(facts: Facts) -> float:
-    """Return the default bound, doubled in float64, where Gramians are as coarse as gradients."""
+    """Return the default bound, doubled in float64, because Gramians are as coarse as gradients."""
     return default_bound(facts) * (1.0 if facts.unit > FLOAT64 else 2.0)
 
 

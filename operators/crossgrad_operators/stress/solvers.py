@@ -1,9 +1,9 @@
 """Oracles in 50 digits that solve small optimization problems.
 
 The operators use active sets in float64, on cosines that a ridge makes definite. The oracles use
-exact active sets. Every result is checked against the optimality conditions; they have only one
-solution, so the result is the minimum. If the gradients are linearly dependent, the weights are not
-unique, and the weights of independent gradients are returned.
+exact active sets. Every result is checked against the optimality conditions. These conditions have
+only one solution, so the result is the minimum. If the gradients are linearly dependent, the
+weights are not unique, and the weights of independent gradients are returned.
 """
 
 from collections.abc import Sequence

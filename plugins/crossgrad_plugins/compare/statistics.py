@@ -310,7 +310,7 @@ def verdicts(family: Sequence[Estimate]) -> list[Verdict]:
 
     The verdict is `different` if the 95 % interval excludes zero, else `equivalent` if the 90 %
     interval is within the margin. With more than five comparisons, the p-value of the test,
-    corrected with Holm's method, must also be below its level.
+    corrected with Holm's method, must also be below the level of the test.
     """
     if len(family) <= UNCORRECTED:
         return [_verdict(member.differs, member.is_small) for member in family]

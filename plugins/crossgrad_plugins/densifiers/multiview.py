@@ -37,8 +37,8 @@ class MultiViewDensityControl(CountsMarkedPixels, AxisSplit):
 
     A Gaussian may grow if it is blended in more than `importance` erroneous pixels of a view on
     average. A primitive is cloned by the norm of its mean gradient, and split by the norm of its
-    absolute gradient. Only a share of the usual pruning candidates is removed; candidates are drawn
-    with weights that increase with their share in the error. After density control has ended,
+    absolute gradient. Only a share of the usual pruning candidates is removed. A candidate is drawn
+    with a weight that increases with its share in the error. After density control has ended,
     Gaussians that are faint or have nearly the largest error are removed at some points of the run.
     For anchors, use the densifier `multiview-gate`.
     """

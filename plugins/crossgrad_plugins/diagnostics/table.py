@@ -24,8 +24,8 @@ from crossgrad_plugins.diagnostics.probe import Measurement
 class Conflict:
     """Conflict between near and far views, over all pairs of one near and one far view.
 
-    A pair counts for a block if both gradients are non-zero and overlap; disjoint gradients are
-    orthogonal without agreeing.
+    A pair counts for a block if both gradients are non-zero and overlap. Gradients without overlap
+    are orthogonal, but this does not mean that the views agree.
 
     Attributes:
         per_block: [B] share of the counted pairs whose dot product is negative; NaN without pairs.

@@ -31,7 +31,7 @@ _BACK: Final = {5: 5, 6: 8, 7: 7, 8: 6}
 
 @dataclass(frozen=True)
 class Sorted:
-    """The image files below a folder, separated by their names.
+    """The image files below a folder, separated into photos and masks by their names.
 
     Attributes:
         photos: Names of the photos.
@@ -83,8 +83,8 @@ def sorted_out(root: Path, files: Sequence[str], wanted: Path | None) -> Sorted:
 def _folders(root: Path, files: Sequence[str], wanted: Path | None) -> dict[str, list[str]]:
     """Return the mask folders among the photos, with the names of their files.
 
-    These are the requested folder, the top folder `masks`, and other folders with this name if
-    most of their files are named after photos next to them.
+    The mask folders are the requested folder, the folder `masks` at the top, and every other folder
+    `masks` in which most files are named after photos next to the folder.
     """
     asked = _asked(root, wanted)
 
@@ -234,7 +234,9 @@ def with_mask(photo: Photo, mask: Path) -> Photo:
 
 
 def counting_pixels(root: Path, photo: Photo) -> NDArray[np.uint8] | None:
-    """Return [H, W] with 255 for pixels that mask and transparency admit, or None for all.
+    """Return [H, W] with 255 for pixels that count by mask and transparency.
+
+    Return None if all pixels count.
 
     Raises:
         UserError: The photo or its mask is damaged, or the mask no longer fits.

@@ -91,7 +91,9 @@ def _may_be_near(scene: Scene, positions: Tensor, distances: Tensor) -> Tensor:
 
 
 def _nearest_beside(scene: Scene, positions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return [N] distance to the nearest training camera with a position [N, 3] outside its photo.
+    """Return [N] the distance of each position [N, 3] to a camera.
+
+    The camera is the nearest training camera whose photo does not show the position.
 
     The distance is infinite for positions that all photos show.
     """

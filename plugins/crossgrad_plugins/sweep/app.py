@@ -159,7 +159,8 @@ class Sweep:
         """Write a grid with the best parameters of each arm and scene, for other seeds.
 
         Raises:
-            UserError: The best parameters are not known yet, the file exists, or cannot be written.
+            UserError: The best parameters are not known yet, or the file exists or cannot be
+                written.
         """
         check_file(path)
         if path.exists():

@@ -77,7 +77,7 @@ def _cell(values: Sequence[float] | None, best: float | None) -> str:
 def write_plan(layout: Layout, cells: Iterable[Job]) -> None:
     """Write runs.csv, the table of runs; rows of earlier grids in the folder follow at the end.
 
-    A run that is in both grids gets its name in the new grid.
+    A run that is in both grids keeps the name that it has in the new grid.
     """
     rows = [(job.id, job.scene, job.label, str(job.seed)) for job in cells]
     ids = {run for run, *_ in rows}

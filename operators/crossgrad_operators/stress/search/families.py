@@ -30,7 +30,10 @@ BLOCK = Block("means", ("means",), True, "geometry", LearningRate(1.0))
 
 
 def cases_of(views: int) -> int:
-    """Return the number of cases of a batch: fewer for more views, which take longer."""
+    """Return the number of cases of a batch.
+
+    Cases with more views take longer, so a batch has fewer of them.
+    """
     return max(1, _CASES // views**2)
 
 
@@ -172,7 +175,7 @@ def search_views(count: int, seed: int = 0) -> Views:
 
 
 def results(operator: Operator, batch: Batch, views: Views | None = None) -> Rows:
-    """Return the results [B, P] of an operator for each case, NaN for cases that raise."""
+    """Return the results [B, P] of an operator for each case, NaN for cases that raise an error."""
     if isinstance(operator, GramianOperator):
         operator = operator.model_copy(update={"granularity": "gaussian"})
     return _results(operator, batch.rows, batch.dtype, views or search_views(batch.views))

@@ -235,7 +235,7 @@ def legend_above(
 
 
 def wrapped(text: str, room: int) -> str:
-    """Break a text into lines of at most `room` letters, as far as its parts are short enough."""
+    """Break a text into lines of at most `room` letters, if its parts are short enough."""
     lines = [""]
     for part in _PARTS.findall(text):
         if lines[-1] and len(lines[-1] + part) > room:

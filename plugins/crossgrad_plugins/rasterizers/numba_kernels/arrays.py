@@ -99,7 +99,9 @@ class DrawOptions:
 
 @dataclass(frozen=True)
 class Projected:
-    """The drawn Gaussians, as records that fill each chunk of Gaussians from its start.
+    """The drawn Gaussians as records.
+
+    The records of a chunk of Gaussians begin at the start of the chunk.
 
     Attributes:
         camera: The view.

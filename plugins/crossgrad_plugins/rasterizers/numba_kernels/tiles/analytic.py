@@ -79,7 +79,7 @@ ROW_V = TILE_HEIGHT
 
 @device
 def main_axes(a: float, b: float, c: float, det: float) -> tuple[float, float, float, float]:
-    """Return cosine and sine of the longer axis, and the variances along both axes, px^2.
+    """Return cosine and sine of the longer axis' angle, and the variances along both axes, px^2.
 
     A round Gaussian has no main axes, so the function returns the axes of the image. The angle is
     in (-90, 90] degrees. The angle is halved without trigonometric functions, so that loops over
