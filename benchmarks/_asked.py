@@ -100,7 +100,7 @@ def of_earlier_grids(runs: Sequence[Run]) -> frozenset[Run]:
 
 
 def asked_for(runs: Sequence[Run], asked: Asked, earlier: frozenset[Run]) -> list[Run]:
-    """Return the runs that the grid requests, from runs with one label, scene and seed.
+    """Return the runs that the grid requests, from runs with the same label, scene and seed.
 
     Args:
         runs: The runs.
@@ -116,7 +116,9 @@ def asked_for(runs: Sequence[Run], asked: Asked, earlier: frozenset[Run]) -> lis
 
 
 def only(runs: Sequence[Run], label: str) -> Run:
-    """Return the first of several runs with one label, scene and seed, which must be repetitions.
+    """Return the first of several runs with the same label, scene and seed.
+
+    These runs must be repetitions of one run.
 
     Raises:
         UserError: The runs have different configurations.

@@ -243,7 +243,8 @@ class Plan(_Part):
     Attributes:
         tuning: The grid that gives the factors of the learning rates.
         grids: The measured grids, in order.
-        rates: Arm -> the tuned arm whose factors it uses. `default` applies to other arms.
+        rates: Arm -> the tuned arm whose factors of the learning rates the arm uses. `default`
+            applies to other arms.
         fixed_rates: Grids whose arms set their own learning rates.
         best_of: The grid that depends on the results of the other grids.
     """

@@ -40,7 +40,7 @@ class Results:
     left_out: Mapping[str, tuple[Path, ...]] = field(default_factory=dict)
 
     def missing(self, arms: Sequence[str], scenes: Sequence[str] = ()) -> tuple[int, int]:
-        """Return the number of pairs (scene, seed) that the arms share, and of missing pairs."""
+        """Return two numbers: pairs (scene, seed) that the arms share, and missing pairs."""
         shared = frozenset.intersection(*(self.planned.get(arm, frozenset()) for arm in arms))
         wanted = {each for each in shared if not scenes or each[0] in scenes}
         ended = {

@@ -128,7 +128,7 @@ class Paper:
         return grid.model_copy(update={"seeds": tuple(seeds)}) if seeds else grid
 
     def grids(self) -> dict[str, Grid]:
-        """Return the package of each source file."""
+        """Return every measured grid as it was last run, or else as it is in the repository."""
         found = {
             name: read_grid(path) if path.is_file() else self.source(name)
             for name in self.plan.grids
@@ -141,7 +141,7 @@ class Paper:
         return found
 
     def results(self) -> Results:
-        """Return the packages that each package imports."""
+        """Return the results of all grids so far."""
         return self._read(self.grids())
 
     def _read(self, grids: Mapping[str, Grid]) -> Results:
@@ -157,7 +157,7 @@ class Paper:
                 unpack(self.place.archive(name), self.place.sweep(name))
 
     def run(self) -> int:
-        """Return the layer of each package: one above the highest layer that it imports.
+        """Tune, run unfinished runs, and write the page.
 
         Return the exit code.
         """

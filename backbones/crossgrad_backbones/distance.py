@@ -187,7 +187,7 @@ class DistanceConditioned(Vanilla):
 
     @override
     def fitted_to(self, scene: Scene) -> tuple[Vanilla, tuple[str, ...]]:
-        """Leave out the conditions if all training cameras are equally far from their mean."""
+        """Leave out the terms with the distance if all training cameras are equally far away."""
         backbone, notes = super().fitted_to(scene)
         if distinguished(_scale_of(scene)):
             return backbone, notes

@@ -54,7 +54,7 @@ def _known(kept: torch.Tensor | None, shape: tuple[int, ...]) -> NDArray[np.floa
 
 
 def _by_block(context: OperatorContext) -> bool:
-    """Return whether each Gramian has its own block: few Gramians, and no name twice."""
+    """Return whether each Gramian has its own block: few Gramians, all names different."""
     blocks = context.blocks
     return len(blocks) <= _BLOCKS and len(set(blocks)) == len(blocks)
 

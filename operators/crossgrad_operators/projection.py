@@ -1,4 +1,4 @@
-"""Operators of pairwise projection: each gradient loses components that conflict with others."""
+"""Operators of pairwise projection: each gradient loses its conflicting components."""
 
 from collections.abc import Mapping
 from typing import ClassVar

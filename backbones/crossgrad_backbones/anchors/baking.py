@@ -1,4 +1,4 @@
-"""Conversion of neural Gaussians to plain ones: the mean over the cameras that see an anchor."""
+"""Conversion of neural Gaussians to plain Gaussians: means over the cameras that see them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

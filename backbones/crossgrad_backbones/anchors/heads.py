@@ -108,7 +108,7 @@ class Heads:
 
     @cached_property
     def networks(self) -> tuple[Network, ...]:
-        """The networks of opacity, covariance and colour, then the feature bank's if enabled."""
+        """The networks of opacity, covariance, colour and (if enabled) the feature bank."""
         outputs = (self.offsets, COVARIANCE * self.offsets, _CHANNELS * self.offsets)
         codes = (0, 0, self.code)
         three = tuple(

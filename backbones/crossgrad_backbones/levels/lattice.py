@@ -185,7 +185,9 @@ def number_of_levels(largest: float, smallest: float, fork: int) -> int:
 
 
 def bounding_range(points: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the lowest coordinate, equal for all axes, and the edge of the cube (Octree-GS).
+    """Return the lowest corner and the edge of a cube around all points (Octree-GS).
+
+    The corner is one number, because its three coordinates are equal.
 
     The bounds are 1.1 times the smallest and the largest coordinate of all points and axes. If all
     coordinates are equal, the edge is 0.

@@ -103,7 +103,9 @@ class Facts:
 
     @property
     def partial(self) -> float:
-        """The sum of |w_1 g_1 + w_2 g_2|, ..., |u| and all |w_k g_k|, over max(|u|, max |w_k g_k|).
+        """The sum of |w_1 g_1 + w_2 g_2|, ..., |u| and all |w_k g_k|, relative to a length.
+
+        This length is max(|u|, max |w_k g_k|).
 
         The value bounds the rounding errors of all products and additions, in units of u kappa.
         """

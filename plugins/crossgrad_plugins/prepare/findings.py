@@ -188,7 +188,7 @@ def bridges_of(
 
 
 def parts_of(plan: Plan, models: Sequence[frozenset[str]]) -> list[frozenset[str]]:
-    """Return the photos of each model, and photos that are missing with most of their folder."""
+    """Return the photos of each model, and the missing photos of mostly missing folders."""
     posed = frozenset().union(*models)
     missing: dict[str, set[str]] = defaultdict(set)
     sizes: Counter[str] = Counter(photo.folder for photo in plan.used)

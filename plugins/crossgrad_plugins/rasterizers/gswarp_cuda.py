@@ -68,7 +68,7 @@ class GswarpRasterizer(Rasterizer):
 
     @hookimpl
     def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
-        """Return objections to a missing package and to other dilations."""
+        """Return objections if a package is missing or the selection is not supported."""
         if selection.device not in self.devices:
             return []
         reasons = []

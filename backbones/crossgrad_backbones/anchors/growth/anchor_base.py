@@ -111,7 +111,7 @@ class NewAnchors:
         return int(self.positions.shape[0])
 
     def limited(self, room: int) -> tuple["NewAnchors", int]:
-        """Return the `room` strongest anchors, in unchanged order, and the number of others."""
+        """Return the `room` strongest anchors in unchanged order, and the count of dropped ones."""
         left_out = max(0, len(self) - room)
         if left_out == 0:
             return self, 0

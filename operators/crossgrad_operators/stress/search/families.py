@@ -199,7 +199,10 @@ def _results(operator: Operator, rows: Rows, dtype: torch.dtype, views: Views) -
 
 
 def _halved(operator: Operator, rows: Rows, dtype: torch.dtype, views: Views) -> Rows:
-    """Split the batch to find the cases that raise, so that other cases keep their results."""
+    """Split the batch to find the cases that raise an error.
+
+    The results of the remaining cases are kept.
+    """
     if len(rows) == 1:
         return np.full(rows[:, 0].shape, np.nan)
     half = len(rows) // 2
