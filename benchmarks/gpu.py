@@ -238,7 +238,7 @@ def theirs(
 
 
 def curve_rows(case: Case, run: Path | None) -> Iterator[Row]:
-    """Yield step, training seconds and PSNR of every evaluation of a long run, if it exists."""
+    """Yield step, training seconds and PSNR of every evaluation of an existing long run."""
     for row in [] if run is None else read_run(run).rows:
         shown = {name: row.get(name) for name in ("step", "train_seconds", "psnr")}
         yield {"run": case.name, **shown}

@@ -214,7 +214,7 @@ class Paper:
         }
 
     def _content(self, name: str, factors: Factors) -> dict[str, Any] | None:
-        """Return a grid with learning rates, or None if it has to wait for other grids."""
+        """Return a grid with learning rates, or None if the grid has to wait for other grids."""
         grid = self.source(name)
         if name == self.plan.best_of.grid:
             best = self._best(self.results(), self.grids())
@@ -297,7 +297,7 @@ def with_rates(grid: Grid, rates: Mapping[str, str], factors: Factors) -> Grid:
 
     Args:
         grid: A grid.
-        rates: Arm of the grid -> the tuned arm whose factors it uses.
+        rates: Arm of the grid -> the tuned arm whose factors the arm uses.
         factors: Tuned arm -> scene -> factor.
 
     Raises:

@@ -85,7 +85,8 @@ def encoded(scale: Tensor, cameras: Sequence[Camera]) -> Tensor:
 def added(weights: Tensor, encoding: Tensor) -> Tensor:
     """Return the terms [N, ...] that weights [N, ..., 2] add for an encoding [2].
 
-    The code avoids a matrix product, because its rounding depends on the number of threads.
+    The code avoids a matrix product, because the rounding of a matrix product depends on the number
+    of threads.
     """
     products: Tensor = weights * encoding
     return products.sum(-1)

@@ -1,4 +1,4 @@
-"""Conversion of neural Gaussians to plain Gaussians: means over the cameras that see them."""
+"""Conversion of neural Gaussians to plain Gaussians by means over cameras."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -255,8 +255,8 @@ def activated(
 def product(left: Tensor, right: Tensor) -> Tensor:
     """Return the product [a, b] of left [n, a] transposed and right [n, b]; n % `PANEL` is 0.
 
-    The sum is computed panel by panel. Matrix libraries split one long sum over all threads, so its
-    rounding depends on the number of threads.
+    The sum is computed panel by panel. Matrix libraries split one long sum over all threads, so the
+    rounding of the sum depends on the number of threads.
     """
     first, second = (torch.unflatten(matrix, 0, (-1, PANEL)) for matrix in (left, right))
     return torch.bmm(first.transpose(1, 2), second).sum(0)

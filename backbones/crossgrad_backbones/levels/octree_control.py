@@ -65,7 +65,7 @@ def requests(
 
     An offset of an anchor of level l requests a cell if its gradient reaches the threshold of level
     l. The offset requests the cell around its Gaussian: on level l + 1 if that level exists and the
-    gradient reaches its threshold, else on level l.
+    gradient reaches the threshold of that level, else on level l.
     """
     levels = parameters["levels"]
     asks = request.eligible & (request.gradient >= thresholds.at(levels)[:, None])

@@ -106,8 +106,8 @@ def _add_solution(
 ) -> None:
     """Add x_i (x_i.r) / l_i for the chosen eigenvectors x_i and eigenvalues l_i to `v`.
 
-    An eigenvector is skipped if the terms of x_i.r cancel up to a share `least`, because it is then
-    orthogonal to r except for rounding noise.
+    An eigenvector is skipped if the terms of x_i.r cancel up to a share `least`, because the
+    eigenvector is then orthogonal to r except for rounding noise.
     """
     for i in chosen:
         inner = products(vectors[:, i], right, 0, len(v), exact)

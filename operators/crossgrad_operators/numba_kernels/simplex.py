@@ -7,8 +7,8 @@ polyhedron {x: x.e_k >= level r_k}:
 
 - MGDA: at any level, the polyhedron's nearest point to 0 has the direction of the shortest
   combination.
-- CAGrad: the direction d with the largest min_k g_k.d in the ball of radius rho about g_0 is the
-  nearest point to g_0 at the level for which its distance from g_0 is rho.
+- CAGrad: let d be the direction with the largest min_k g_k.d in the ball of radius rho about g_0.
+  Then d is the point nearest to g_0 at the level for which this point has the distance rho.
 """
 
 from typing import NamedTuple
@@ -287,7 +287,7 @@ def _defined(problem: Polyhedron, search: Search) -> float:
 
 @strict_device
 def _cagrad_pair(n1: float, n2: float, cosine: float, c: float) -> tuple[float, float, float]:
-    """Return the weight of g_1 in g_w, |g_w| and |g_0| (g_0 the mean of both), for 1 = n1 >= n2.
+    """Return the weight of g_1 in g_w, |g_w| and |g_0| (g_0 is the mean), for norms 1 = n1 >= n2.
 
     The objective (a - b) x / 2 + c |g_0| sqrt(D (x - x_0)^2 + h^2) is convex in x. Sums of squares
     are arranged so that only the cosine itself can cancel. The function returns the weight of the

@@ -126,7 +126,10 @@ def default_bound(facts: Facts) -> float:
 
 
 def pairwise_bound(facts: Facts) -> float:
-    """Return the default bound, doubled in float64, because Gramians are as coarse as gradients."""
+    """Return the default bound, doubled in float64.
+
+    In float64, Gramians are as coarse as gradients.
+    """
     return default_bound(facts) * (1.0 if facts.unit > FLOAT64 else 2.0)
 
 
@@ -146,7 +149,10 @@ def determined(facts: Facts) -> bool:
 
 
 def clear(facts: Facts) -> bool:
-    """Return True if `determined` holds, and directions are exactly dependent or far from it."""
+    """Return True if `determined` holds and no directions are nearly dependent.
+
+    Exactly dependent directions are allowed.
+    """
     return determined(facts) and not _any_between(
         [*facts.sines, *facts.dependence], DEPENDENT, INDEPENDENT
     )

@@ -165,8 +165,8 @@ def _rough_bargain(cosine: Matrix) -> Vector:
 def _is_hopeless(cosine: Matrix, beta: Vector) -> bool:
     """Return True if the convex combination beta / sum beta proves that the result is zero.
 
-    x is this combination and u the sum of the bargain, with |u|^2 = K. Then sum x_k / beta_k =
-    sum x_k e_k.u is at most |sum x_k e_k| sqrt K, and so is the inverse of the largest beta.
+    x is this combination and u the sum of the bargain, with |u|^2 = K. Then sum x_k / beta_k = sum
+    x_k e_k.u is at most |sum x_k e_k| sqrt K. The inverse of the largest beta has the same bound.
     """
     share = form(cosine, beta) / sum(beta) ** 2
     return bool(len(beta) * share <= 2 * number(OPPOSITE) / len(beta))

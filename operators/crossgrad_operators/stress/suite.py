@@ -72,7 +72,7 @@ def homogeneity(operator: Operator) -> float | None:
 
 
 def permutation(operator: Operator) -> float | None:
-    """Return the error after two views, with their labels and distances, exchange their order."""
+    """Return the error after two views change places, together with their labels and distances."""
     if not operator.views.admits(2):
         return None
     case, views = _rows(2), sample_views(2)

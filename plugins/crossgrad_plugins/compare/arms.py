@@ -45,9 +45,9 @@ def arms_of(runs: Sequence[Run], failed: Sequence[Run] = ()) -> tuple[Arm, ...]:
 
     An arm contains the runs that agree in every setting that varies within a scene. A setting that
     differs only between scenes, such as a degree that the data of a scene cannot support, does not
-    separate arms. If every run has a label of a sweep, the runs of one label form an arm. If a
-    label covers several configurations on one scene, for instance after two sweeps, the settings of
-    the runs separate them.
+    separate arms. If every run has a label of a sweep, the runs with the same label form an arm. If
+    a label covers several configurations on one scene, for instance after two sweeps, the settings
+    of the runs separate the configurations.
 
     Args:
         runs: The finished runs; at least one.

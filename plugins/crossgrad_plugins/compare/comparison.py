@@ -43,7 +43,7 @@ class Comparison:
         unlike: Scenes whose runs assign different regimes to the same held-out views.
         target: The quality to reach; None for the final quality of the weakest arm, by scene.
         checked: Notes of the checks about results that are not compared, with the reasons.
-        unused: Folder of an unfinished or unreadable run -> why it is left out.
+        unused: Folder of an unfinished or unreadable run -> why the run is left out.
     """
 
     arms: tuple[Arm, ...]

@@ -180,7 +180,7 @@ def _unpaired(comparison: Comparison) -> Sentence:
 def _of_the_best(comparison: Comparison) -> list[Sentence]:
     """Compare the arm with the best mean with the other arms.
 
-    This arm leads by its mean over runs; the estimate from pairs can differ from this mean.
+    The best arm is chosen by its mean over runs. The estimate from pairs can differ from this mean.
     """
     leader = comparison.ranking[0]
     with_leader = [

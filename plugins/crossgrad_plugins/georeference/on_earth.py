@@ -48,7 +48,8 @@ def _harmonics_turn(rotation: Tensor, degree: int) -> Tensor:
     """Return the matrix [B, B], float64, that rotates coefficients of bands 1 to `degree`.
 
     The harmonics of a rotated direction are linear in the harmonics of the direction, with an
-    orthogonal matrix for each band. The matrix is fitted to their values in enough directions.
+    orthogonal matrix for each band. The matrix is fitted to the values of the harmonics in enough
+    directions.
     """
     directions = _directions()
     before, after = (

@@ -50,8 +50,9 @@ def sorted_out(root: Path, files: Sequence[str], wanted: Path | None) -> Sorted:
     Args:
         root: Folder of the photos.
         files: Names of the image files below it.
-        wanted: Folder of the masks. If None, masks are searched in the folder `masks`, in other
-            folders named `masks` whose files match photos next to them, and next to the photos.
+        wanted: Folder of the masks. If None, masks are searched in three places: in the folder
+            `masks`, in other folders named `masks` whose files match photos next to them, and next
+            to the photos.
 
     Raises:
         UserError: The folder is missing, or contains no mask for any photo.
@@ -139,7 +140,7 @@ def _paired(root: Path, folder: str, photos: Sequence[str]) -> dict[str, Path]:
 
 
 def _usual(root: Path, photos: Sequence[str], folders: Iterable[str]) -> dict[str, Path]:
-    """Return the default masks: in `masks`, in other folders with this name, or next to photos."""
+    """Return the default masks: in `masks`, in other folders named `masks`, or next to photos."""
     stems = {name: str(PurePosixPath(name).with_suffix("")) for name in photos}
     beside = {name: [root / f"{stem}{end}.png" for end in _ENDS] for name, stem in stems.items()}
     masks = _first(root, beside)

@@ -108,7 +108,8 @@ def _below(values: Mapping[str, Any], overriding: Mapping[str, Any]) -> dict[str
     """Merge values with the settings that override them, in one layer.
 
     If a setting chooses another component, the options of the replaced component are dropped. A run
-    has one length, so if a setting sets the length, a length among the values is dropped, too.
+    has only one length. If a setting sets the length, a length among the values is therefore
+    dropped.
     """
     lengths = LENGTHS if LENGTHS & overriding.keys() else frozenset()
     components = {name.removesuffix(".name") for name in overriding if name.endswith(".name")}

@@ -32,7 +32,7 @@ BLOCK = Block("means", ("means",), True, "geometry", LearningRate(1.0))
 def cases_of(views: int) -> int:
     """Return the number of cases of a batch.
 
-    Cases with more views take longer, so a batch has fewer of them.
+    Cases with more views take longer, so a batch contains fewer of these cases.
     """
     return max(1, _CASES // views**2)
 

@@ -176,9 +176,9 @@ def square(k: int, width: int, height: int, found: NDArray[np.float64]) -> tuple
     """Return the published radius of projected Gaussian k and the pixels that it may touch.
 
     The function returns the pixels of all 16 x 16 tiles that overlap a square around the mean. Half
-    the side of the square is the published radius. The radius is 0 if the square is outside the
-    image (3DGS: three standard deviations; the squared half difference of the variances is at least
-    0.1).
+    the side of the square is the published radius. The radius is three standard deviations, as in
+    3DGS, or 0 if the square is outside the image. The squared half difference of the variances is
+    at least 0.1.
     """
     u, v = get(found, MEAN_U, k), get(found, MEAN_V, k)
     a, b, c = get(found, VARIANCE_X, k), get(found, COVARIANCE, k), get(found, VARIANCE_Y, k)

@@ -72,9 +72,9 @@ def offsets(
 ) -> tuple[Tensor, Tensor]:
     """Return the mean minus the pixel centre for every pixel and Gaussian: dx [P, G] and dy [P, G].
 
-    The backward pass sums the pixels' gradients for the means. For the probe's first two columns it
-    sums their absolute values. For the columns after the axes, if there are such columns, it sums
-    the result of `binned_directions`.
+    The backward pass sums the pixels' gradients for the means. For the probe's first two columns
+    the backward pass sums their absolute values. For the columns after the axes, if there are such
+    columns, the backward pass sums the result of `binned_directions`.
 
     Args:
         means: [G, 2] pixels.
