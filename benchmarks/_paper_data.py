@@ -25,7 +25,7 @@ class _Part(BaseModel):
 
 
 class Pairing(_Part):
-    """Two arms whose held-out figures are compared.
+    """Two arms whose held-out metrics are compared.
 
     Attributes:
         first: Name of an arm.
@@ -39,7 +39,7 @@ class Pairing(_Part):
 
 
 class Reading(_Part):
-    """A figure of diagnostics.csv, averaged over the probes of a run.
+    """A value of diagnostics.csv, averaged over the probes of a run.
 
     Attributes:
         column: Column of the table.
@@ -58,7 +58,7 @@ class Probe(_Part):
     Attributes:
         arm: Name of the arm, which uses the observer `diagnostics`.
         first: The figure.
-        second: The figure that is subtracted, or None.
+        second: The statistic that is subtracted, or None.
         scenes: Scenes that count, or empty for all.
     """
 
@@ -97,7 +97,7 @@ class Check(_Part):
 
     Attributes:
         test: Two arms.
-        probe: A figure of the gradients.
+        probe: A statistic of the gradients.
         arithmetic: The paper's own figures.
         none: Reason why the statement is not tested.
         expected: The statement about `test`, or about the sign of `probe`.
@@ -152,7 +152,7 @@ class Row(_Part):
     Attributes:
         first: The arm that represents the row.
         second: The arm that represents the reference, only used with `first`.
-        probe: A figure of the gradients that is used instead.
+        probe: A statistic of the gradients that is used instead.
         none: Reason why the row is not tested.
         expected: The row's statement about the sign of `probe`.
         margin: Largest difference of `probe` that counts as equal.
@@ -202,7 +202,7 @@ class Claims(_Part):
 
     Attributes:
         source: The paper.
-        untestable: Reason why figures on the paper's scenes are not tested.
+        untestable: Reason why values on the paper's scenes are not tested.
         recipes: Scenes of the paper -> instructions for readers who have these scenes.
         tables: Tables of the paper.
         sections: Claims of the paper's text.
@@ -282,7 +282,7 @@ def read_plan() -> Plan:
 
 
 def read_tables() -> Tables:
-    """Return the figures of the paper's tables."""
+    """Return the values of the paper's tables."""
     found: dict[str, dict[str, list[Figure]]] = {}
     with (DATA / "tables.csv").open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
@@ -293,7 +293,7 @@ def read_tables() -> Tables:
 
 
 def values(tables: Tables, table: str, method: str, metric: str) -> dict[str, float]:
-    """Return scene -> value of a method, without scenes that have no value."""
+    """Return the value of a method for each scene, without scenes that have no value."""
     return {
         figure.scene: figure.value
         for figure in tables[table][method]

@@ -37,7 +37,7 @@ def page(claims: Claims, results: Results, tables: Tables, extra: Sequence[str] 
     Args:
         claims: The paper's claims.
         results: The results of the grids.
-        tables: The figures of the paper.
+        tables: The values of the paper.
         extra: Arms of the other backbones, in pairs by backbone.
     """
     blocks = [_table(table, claims, results, tables) for table in claims.tables]
@@ -194,7 +194,10 @@ def _expected(tables: Tables, table: Table, method: str) -> Expected:
 
 
 def _differences(tables: Tables, table: Table, method: str) -> dict[str, float]:
-    """Return scene -> PSNR minus the reference's PSNR. A table of gains gives its own figures."""
+    """Return PSNR minus the reference's PSNR for each scene.
+
+    A table of gains already contains these differences.
+    """
     gains = values(tables, table.id, method, "PSNR_gain")
     if gains or table.reference is None:
         return gains

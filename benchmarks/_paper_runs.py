@@ -133,7 +133,7 @@ def probe_rows(run: Run, file: str = PROBES) -> list[dict[str, str]]:
 def probed(
     run: Run, reading: Reading, rows: Sequence[Mapping[str, str]] | None = None
 ) -> float | None:
-    """Return a figure of a run's gradients, averaged over probes, or None if it is missing."""
+    """Return a statistic of a run's gradients, averaged over probes, or None if it is missing."""
     found = [
         number(row, reading.column)
         for row in (probe_rows(run) if rows is None else rows)

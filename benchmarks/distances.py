@@ -68,7 +68,7 @@ class Probes:
 
     Attributes:
         runs: Arm -> scene and seed -> run.
-        values: Folder of a run -> photo -> figure.
+        values: Folder of a run -> photo -> metric.
         bands: The bands of views.
         quantity: The quantity of the figures.
     """
@@ -134,7 +134,7 @@ def figures_of(
     """Return folder of a run -> photo -> metric of its model, or of its PLY drawn on black.
 
     Raises:
-        UserError: There is no such figure, or a run cannot be evaluated.
+        UserError: The metric does not exist, or a run cannot be evaluated.
     """
     measured = [
         {

@@ -62,8 +62,8 @@ class Short:
     Args:
         scene: SCENE.
         kept: The file, with one JSON line per case.
-        place: Scene, GPU and commit of the figures. Figures of another scene, GPU or commit are not
-            used.
+        place: Scene, GPU and commit of the measurements. Figures of another scene, GPU or commit
+            are not used.
     """
 
     def __init__(self, scene: Path, kept: Path, place: str) -> None:

@@ -127,7 +127,7 @@ def _cases(given: argparse.Namespace) -> Iterator[tuple[int, Path, str]]:
 
 
 def _figures(folder: Path, judge: Path, *, independent: bool) -> Row:
-    """Return the figures of a run, with its PLY drawn on the held-out views of another run."""
+    """Return the metrics of a run, with its PLY drawn on the held-out views of another run."""
     if _held_out(folder) != _held_out(judge):
         raise SystemExit(
             f"{folder} and {judge} do not hold out the same views: give both a --split"

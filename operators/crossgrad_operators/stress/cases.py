@@ -131,7 +131,7 @@ def _at_cosine(cosine: float, first: float, second: float) -> Rows:
 
 
 def _angles() -> Iterator[Case]:
-    """Yield cases with cosines close to -1 and +1, eps is the sine."""
+    """Yield cases with cosines close to -1 and +1; eps is the sine of the angle."""
     for eps in (1e-2, 1e-4, 1e-5):
         yield short(f"cos -1 + {eps**2 / 2:.0e}", [[1.0, 0.0], [-1.0, eps]])
         yield short(f"cos 1 - {eps**2 / 2:.0e}", [[1.0, 0.0], [1.0, eps]])

@@ -232,14 +232,14 @@ class Cells:
         return any(len(by) > 1 for problems in self.runs.values() for by in problems.values())
 
     def at(self, length: Length) -> dict[str, dict[Problem, Run]]:
-        """Return arm -> scene and seed -> run of the given length."""
+        """Return the runs of the given length, by arm, and then by scene and seed."""
         return {
             arm: {problem: by[length] for problem, by in problems.items() if length in by}
             for arm, problems in self.runs.items()
         }
 
     def main(self) -> dict[str, dict[Problem, Run]]:
-        """Return arm -> scene and seed -> the run that represents them.
+        """Return the runs that represent each scene and seed, by arm, and then by scene and seed.
 
         The run has the length that is most frequent on its scene; of two equally frequent lengths,
         the longer one is used. An arm uses another length on a scene if it has more than twice as
@@ -271,7 +271,7 @@ class Cells:
         }
 
     def _chosen(self) -> dict[tuple[str, str], Length]:
-        """Return arm and scene -> the length used there.
+        """Return the length that is used for each arm and scene.
 
         An arm without a run of the usual length has no entry.
         """

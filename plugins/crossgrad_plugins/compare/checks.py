@@ -235,7 +235,7 @@ def _check_definition(runs: Sequence[Run], key: str) -> None:
 
 
 def _definitions(runs: Sequence[Run], key: str) -> dict[str, str]:
-    """Return definition -> the first run that states it; runs without a definition are ignored."""
+    """Return the first run that states each definition; runs without a definition are ignored."""
     definitions: dict[str, str] = {}
     for run in runs:
         text = (run.summary.get("definitions") or {}).get(key)

@@ -61,7 +61,7 @@ class WorstView:
 
 
 def worst_views(comparison: Comparison) -> dict[str, list[WorstView]]:
-    """Return scene -> its held-out views, the worst first, without pictures."""
+    """Return the held-out views of each scene, the worst first, without pictures."""
     by_scene: dict[str, list[WorstView]] = {}
     for scene in comparison.scenes:
         values: dict[tuple[str, str], dict[str, list[float]]] = {}

@@ -127,7 +127,7 @@ def text_of(length: tuple[str, float]) -> str:
 
 
 def settings_of(config: Mapping[str, Any]) -> Settings:
-    """Return setting -> value, for the settings that can separate arms.
+    """Return the values of the settings that can separate arms, by setting.
 
     A setting that is null counts as not set, and its value is `-`. A component becomes `backbone`,
     and its options become `backbone.sh_degree`. A chain of operators becomes `operator` with the

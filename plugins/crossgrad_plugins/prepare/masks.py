@@ -133,7 +133,7 @@ def _of_photos(root: Path, folder: str, inside: Iterable[str], photos: Sequence[
 
 
 def _paired(root: Path, folder: str, photos: Sequence[str]) -> dict[str, Path]:
-    """Return photo -> mask for the masks in a folder below `root` and the photos next to it."""
+    """Return the mask of each photo, for masks in a folder below `root` and photos next to it."""
     below = {name: path for name in photos if (path := _below(folder, name)) is not None}
     pairs = pair_masks(root / folder, [*below.values()])
     return {name: pairs[path] for name, path in below.items() if path in pairs}

@@ -228,7 +228,7 @@ def choices(grid: Grid) -> list[Choice]:
 
 
 def _axes(grid: Grid, arm: Arm) -> dict[str, tuple[Any, ...]]:
-    """Return setting -> values, for the settings that vary in an arm."""
+    """Return the values of the settings that vary in an arm, by setting."""
     parameters = {**grid.parameters, **arm.parameters}
     return dict(axis for name, parameter in parameters.items() for axis in parameter.axes(name))
 

@@ -96,7 +96,10 @@ class Look:
 
 
 def looks(arms: Sequence[str]) -> dict[str, Look]:
-    """Return arm -> look; arms also differ in marker and line style, for print without colours."""
+    """Return the look of each arm.
+
+    Arms also differ in marker and line style, for print without colours.
+    """
     return {
         arm: Look(
             COLORS[index % len(COLORS)],
@@ -172,7 +175,7 @@ def _for_page(svg: str, name: str) -> str:
 
 
 def variables() -> dict[str, str]:
-    """Return name of a style sheet variable of the page -> its colour in figures."""
+    """Return the colour in figures of each style sheet variable of the page."""
     series = {f"series-{number}": color for number, color in enumerate(COLORS)}
     return {"ink": INK, "faint": FAINT, "grid": GRID, **series}
 
