@@ -196,7 +196,10 @@ def _print_gains(
     old: Mapping[tuple[str, str], dict[int, Row]],
     figure: str | None,
 ) -> None:
-    """Print the gains of a code version over `old`: by scene, and pooled over scenes."""
+    """Print the gains of a code version over `old`: by scene, and pooled.
+
+    Scenes with equal lengths of runs are pooled.
+    """
     gains: dict[str, dict[str, list[float]]] = defaultdict(dict)
     margin, digits = (0.005, 4) if figure == "ssim" else (0.1, 2)
     for (scene, lengths), codes in cases:

@@ -188,7 +188,7 @@ class DistanceConditioned(Vanilla):
 
     @override
     def fitted_to(self, scene: Scene) -> tuple[Vanilla, tuple[str, ...]]:
-        """Leave out the terms with the distance if all training cameras are equally far away."""
+        """Leave out the distance terms if all training cameras are equally far away."""
         backbone, notes = super().fitted_to(scene)
         if distinguished(_scale_of(scene)):
             return backbone, notes

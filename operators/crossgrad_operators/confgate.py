@@ -17,7 +17,7 @@ _THRESHOLDS: Final = {"v2": 0.9, "low": 0.6}
 
 
 class ConfGate(GramianOperator):
-    """Projects a pair only if the pair conflicts now and has probably conflicted before.
+    """Projects a pair only if the pair conflicts now and has probably done so for some time.
 
     The mean mu and the variance v of the block's cosine are exponential averages (bias-corrected)
     with n_eff = (1 + beta) / (1 - beta) effective samples. P(conflict) = Phi(-mu / sqrt(v / n_eff +

@@ -121,7 +121,10 @@ class Lattice:
         return (levels == 0) | (distances <= farthest)
 
     def _forks(self, exponents: Tensor) -> Tensor:
-        """Return fork^exponents [A], one for each anchor, in the number type of `exponents`."""
+        """Return fork^exponents in the number type of `exponents`.
+
+        A step computes this value for every anchor.
+        """
         # Do not use exp2: its rounding depends on the number of threads.
         return torch.exp(torch.log(self.fork) * exponents)
 
@@ -209,7 +212,10 @@ def automatic_root_cell(points: NDArray[np.float64]) -> float:
 
 
 def root_above(middle_cell: float, levels: int, fork: int) -> float:
-    """Return the cell edge of level 0."""
+    """Return the cell edge of level 0 (Octree-GS).
+
+    With this edge, cells of level `levels // 2 - 1` have the edge `middle_cell`.
+    """
     return middle_cell * float(fork) ** (levels // 2 - 1)
 
 

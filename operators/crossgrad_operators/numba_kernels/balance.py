@@ -72,8 +72,8 @@ def _of_present(
 def _graded(norms: Pairs, cosines: Pairs, exact: Exact) -> Pairs:
     """Return D C D [n, n], where D contains the norms divided by the largest norm.
 
-    The matrix has the rank of C. At large norm ratios, the eigenvalues of the Gramian itself would
-    not show this rank.
+    The matrix has the rank of C. At large norm ratios, the eigenvalues of D C D would not show this
+    rank.
     """
     n = len(norms)
     longest, _ = longest_of(norms)

@@ -159,7 +159,10 @@ def clear(facts: Facts) -> bool:
 
 
 def independent(facts: Facts) -> bool:
-    """Return True if `determined` holds and no more than two directions are nearly dependent."""
+    """Return True if `determined` holds and no directions are nearly dependent.
+
+    With one or two directions, dependence is not tested.
+    """
     several = len(facts.norms) > 2  # noqa: PLR2004
     return determined(facts) and not (
         several and _any_between(facts.dependence, DEPENDENT, REGULAR)

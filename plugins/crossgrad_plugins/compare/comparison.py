@@ -98,7 +98,7 @@ class Comparison:
 
     @cached_property
     def left_out(self) -> Mapping[str, str]:
-        """Folder -> why it is left out."""
+        """Folder -> why the folder is left out."""
         repeated = {name: f"repeats {kept}" for name, kept in self.cells.repetitions.items()}
         return {**self.unused, **repeated, **self.cells.unlike}
 

@@ -189,7 +189,7 @@ def _spread(views: Sequence[View], most: int) -> list[View]:
 
 
 def _spacings(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return [P] distances of the points to their neighbours, as 3DGS sizes initial Gaussians."""
+    """Return [P] distances of the points to their neighbours, like the initial sizes of 3DGS."""
     from scipy.spatial import cKDTree
 
     count = min(_NEAREST, len(points) - 1)
