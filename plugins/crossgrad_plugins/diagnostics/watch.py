@@ -35,7 +35,7 @@ GROUPINGS = ("radial", "altitude", "footprint", "kmeans", "gmm")
 
 
 def distances_of(scene: Scene) -> dict[str, NDArray[np.float64]]:
-    """Return name -> [N] distances of the training views.
+    """Return distances [N] of the training views, by name of the distance.
 
     `radial`: distance from the mean camera, as in the paper. `depth`: median depth of the SfM
     points divided by the focal length, relative to the median view; only if every view sees points.

@@ -193,7 +193,7 @@ class Choice(_Part):
     def settings(
         self, base: Settings, scene: str | None, assignments: Sequence[str] = ()
     ) -> Settings:
-        """Return the settings of the choice's runs on a scene, without the seed.
+        """Return the settings of this configuration's runs on a scene, without the seed.
 
         Args:
             base: The settings of all runs of the grid.
