@@ -22,7 +22,9 @@ _OTHERWISE: Final = ("exposure_from", "data.init", "plan")
 
 @dataclass(frozen=True)
 class Asked:
-    """The settings that a grid names for an arm on a scene. Other settings may have any value.
+    """The settings that a grid names for an arm on a scene.
+
+    Settings that the grid does not name may have any value.
 
     Attributes:
         config: The configuration.
@@ -55,7 +57,10 @@ class Asked:
         return cls(config, named, bool(LENGTHS & settings.keys()))
 
     def fits(self, run: Run) -> bool:
-        """Return True if a run uses all named settings. Undecided or unknown settings fit."""
+        """Return True if a run uses all named settings.
+
+        A setting that is undecided or unknown counts as a match.
+        """
         return (not self.has_length or self._fits_length(run)) and all(
             asked in {run.settings.get(name, asked), *_LEFT_OPEN}
             for name, asked in self.settings.items()
@@ -95,14 +100,14 @@ def of_earlier_grids(runs: Sequence[Run]) -> frozenset[Run]:
 
 
 def asked_for(runs: Sequence[Run], asked: Asked, earlier: frozenset[Run]) -> list[Run]:
-    """Return the runs that the grid requests, from runs with one label, scene and seed.
+    """Return the runs that the grid requests, from runs with the same label, scene and seed.
 
     Args:
         runs: The runs.
         asked: The settings that the grid names.
-        earlier: Runs of earlier grids, by the table of their sweep. If all runs are earlier runs,
-            none of them counts, because the current run has not ended. If a current run exists but
-            does not fit, the table belongs to another grid and is ignored.
+        earlier: Runs of earlier grids, by the table of their sweep. If all runs belong to earlier
+            grids, no run is returned, because the current run has not ended. If a current run
+            exists but does not fit, the table belongs to another grid and is ignored.
     """
     fitting = [run for run in runs if asked.fits(run)]
     current = [run for run in fitting if run not in earlier]
@@ -111,7 +116,9 @@ def asked_for(runs: Sequence[Run], asked: Asked, earlier: frozenset[Run]) -> lis
 
 
 def only(runs: Sequence[Run], label: str) -> Run:
-    """Return the first of several runs with one label, scene and seed, which must be repetitions.
+    """Return the first of several runs with the same label, scene and seed.
+
+    These runs must be repetitions of one run.
 
     Raises:
         UserError: The runs have different configurations.

@@ -253,7 +253,7 @@ def shifted(model: Model, rng: np.random.Generator) -> Wrong:
 
 
 def half_elsewhere(model: Model, rng: np.random.Generator) -> Wrong:
-    """Exchange the poses of half of the photos among these photos."""
+    """Exchange the poses of one half of the photos among each other."""
     views = rng.permutation(len(model.photos))[: len(model.photos) // 2]
     photos = list(model.photos)
     for a, b in zip(views, np.roll(views, 1), strict=True):

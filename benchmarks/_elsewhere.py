@@ -1,4 +1,4 @@
-"""Evaluate runs on another capture of the same place, and store the figures with their origin."""
+"""Evaluate runs on another capture of the same place, and store metrics with their origin."""
 
 import csv
 import json
@@ -53,7 +53,7 @@ class Capture:
 
 @dataclass(frozen=True)
 class Table:
-    """The figures of a run on the views of another capture, with one row per view.
+    """The metric values of a run on the views of another capture, with one row per view.
 
     Attributes:
         run: The run.
@@ -77,10 +77,12 @@ class Table:
         return self._origin() is None
 
     def figures(self, name: str) -> dict[str, float]:
-        """Return photo -> figure. The run is evaluated if the table has another origin.
+        """Return the metric value of each photo.
+
+        The run is evaluated if the table has another origin.
 
         Raises:
-            UserError: There is no such figure, or the run cannot be evaluated.
+            UserError: The metric does not exist, or the run cannot be evaluated.
         """
         if not self.path.is_file() or not self._is_of_this():
             self._evaluate()
@@ -144,7 +146,7 @@ class Table:
 
 
 def no_figure(name: str, offered: list[str]) -> UserError:
-    """Return the error for an unknown figure, with the names of the available figures."""
+    """Return the error for an unknown metric, with the names of the available metrics."""
     return UserError(
         "unknown metric",
         where="--figure",

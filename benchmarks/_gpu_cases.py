@@ -106,5 +106,5 @@ def is_chosen(case: Case, only: Sequence[str] | None) -> bool:
 
 
 def stops(steps: int) -> tuple[int, ...]:
-    """Return the steps of a long run that have figures in the table."""
+    """Return the steps of a long run that have a row in the table."""
     return (*(stop for stop in STOPS if stop < steps), steps)

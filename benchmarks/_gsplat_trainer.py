@@ -32,7 +32,9 @@ class Stop:
 def trained(
     examples: Path, scene: Path, runs: Path, stops: Sequence[int], limit: float | None
 ) -> tuple[list[Stop], str]:
-    """Train to the last stop, unless its figures exist. Return the reached stops and a failure.
+    """Train to the last stop, unless the results of the last stop exist.
+
+    Return the reached stops and a failure.
 
     Args:
         examples: The folder of gsplat's examples.

@@ -25,7 +25,7 @@ class _Part(BaseModel):
 
 
 class Pairing(_Part):
-    """Two arms whose held-out figures are compared.
+    """Two arms whose held-out metrics are compared.
 
     Attributes:
         first: Name of an arm.
@@ -39,7 +39,7 @@ class Pairing(_Part):
 
 
 class Reading(_Part):
-    """A figure of diagnostics.csv, averaged over the probes of a run.
+    """A value of diagnostics.csv, averaged over the probes of a run.
 
     Attributes:
         column: Column of the table.
@@ -53,12 +53,12 @@ class Reading(_Part):
 
 
 class Probe(_Part):
-    """A figure of the gradients of an arm's runs, or the difference of two figures of these runs.
+    """A statistic of the gradients in an arm's runs, or the difference of two such statistics.
 
     Attributes:
         arm: Name of the arm, which uses the observer `diagnostics`.
         first: The figure.
-        second: The figure that is subtracted, or None.
+        second: The statistic that is subtracted, or None.
         scenes: Scenes that count, or empty for all.
     """
 
@@ -69,7 +69,7 @@ class Probe(_Part):
 
 
 class Arithmetic(_Part):
-    """A statement about figures of the paper's own tables: shares of a gap within bounds.
+    """A statement about the paper's own tables: a method closes a certain share of a gap.
 
     Attributes:
         table: Table that contains `method` and `base`.
@@ -97,7 +97,7 @@ class Check(_Part):
 
     Attributes:
         test: Two arms.
-        probe: A figure of the gradients.
+        probe: A statistic of the gradients.
         arithmetic: The paper's own figures.
         none: Reason why the statement is not tested.
         expected: The statement about `test`, or about the sign of `probe`.
@@ -137,7 +137,7 @@ class Claim(Check):
 
     Attributes:
         id: A short name, unique.
-        where: Place of the statement in the paper.
+        where: Section or table of the paper that contains the statement.
         says: The statement.
     """
 
@@ -152,7 +152,7 @@ class Row(_Part):
     Attributes:
         first: The arm that represents the row.
         second: The arm that represents the reference, only used with `first`.
-        probe: A figure of the gradients that is used instead.
+        probe: A statistic of the gradients that is used instead.
         none: Reason why the row is not tested.
         expected: The row's statement about the sign of `probe`.
         margin: Largest difference of `probe` that counts as equal.
@@ -202,7 +202,7 @@ class Claims(_Part):
 
     Attributes:
         source: The paper.
-        untestable: Reason why figures on the paper's scenes are not tested.
+        untestable: Reason why values on the paper's scenes are not tested.
         recipes: Scenes of the paper -> instructions for readers who have these scenes.
         tables: Tables of the paper.
         sections: Claims of the paper's text.
@@ -215,7 +215,7 @@ class Claims(_Part):
     sections: tuple[Section, ...]
 
     def checks(self) -> Iterator[Check]:
-        """Yield all checks."""
+        """Yield the checks of all tables and sections."""
         for table in self.tables:
             yield from (row.check("better") for row in table.rows.values())
         for section in self.sections:
@@ -223,12 +223,13 @@ class Claims(_Part):
 
 
 class BestOf(_Part):
-    """A grid whose arms are run with the best methods of other grids.
+    """A grid whose arms are run with the best methods that other grids have measured.
 
     Attributes:
         grid: The grid.
         candidates: Arms from which the best methods are chosen.
-        scaffold_like: Backbone -> tuned arms whose rates it uses, for one view and for more views.
+        scaffold_like: Backbone -> tuned arms whose learning rates the backbone uses, for one view
+            and for more views.
     """
 
     grid: str
@@ -242,8 +243,9 @@ class Plan(_Part):
     Attributes:
         tuning: The grid that gives the factors of the learning rates.
         grids: The measured grids, in order.
-        rates: Arm -> the tuned arm whose factors it uses. `default` applies to other arms.
-        fixed_rates: Grids whose arms set their own rates.
+        rates: Arm -> the tuned arm whose factors of the learning rates the arm uses. `default`
+            applies to other arms.
+        fixed_rates: Grids whose arms set their own learning rates.
         best_of: The grid that depends on the results of the other grids.
     """
 
@@ -280,7 +282,7 @@ def read_plan() -> Plan:
 
 
 def read_tables() -> Tables:
-    """Return the figures of the paper's tables."""
+    """Return the values of the paper's tables."""
     found: dict[str, dict[str, list[Figure]]] = {}
     with (DATA / "tables.csv").open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
@@ -291,7 +293,7 @@ def read_tables() -> Tables:
 
 
 def values(tables: Tables, table: str, method: str, metric: str) -> dict[str, float]:
-    """Return scene -> value of a method, without scenes that have no value."""
+    """Return the value of a method for each scene, without scenes that have no value."""
     return {
         figure.scene: figure.value
         for figure in tables[table][method]

@@ -37,7 +37,7 @@ def page(claims: Claims, results: Results, tables: Tables, extra: Sequence[str] 
     Args:
         claims: The paper's claims.
         results: The results of the grids.
-        tables: The figures of the paper.
+        tables: The values of the paper.
         extra: Arms of the other backbones, in pairs by backbone.
     """
     blocks = [_table(table, claims, results, tables) for table in claims.tables]
@@ -185,7 +185,7 @@ def _command(check: Check, results: Results) -> str:
 
 
 def _expected(tables: Tables, table: Table, method: str) -> Expected:
-    """Return the relation to the table's reference, by the mean difference of a row."""
+    """Return the relation between a row and the table's reference, from their mean difference."""
     found = _differences(tables, table, method)
     mean = fmean(found.values()) if found else 0.0
     if abs(mean) < _SAME:
@@ -194,7 +194,10 @@ def _expected(tables: Tables, table: Table, method: str) -> Expected:
 
 
 def _differences(tables: Tables, table: Table, method: str) -> dict[str, float]:
-    """Return scene -> PSNR minus the reference's PSNR. A table of gains gives its own figures."""
+    """Return PSNR minus the reference's PSNR for each scene.
+
+    A table of gains already contains these differences.
+    """
     gains = values(tables, table.id, method, "PSNR_gain")
     if gains or table.reference is None:
         return gains
@@ -222,7 +225,7 @@ def _figures(tables: Tables, table: str, method: str) -> str:
 
 
 def _second_view(results: Results) -> Iterator[str]:
-    """Yield the gain of the second view on each scene, at equal steps, views and seconds."""
+    """Yield a table that shows the gain of the second view, at equal steps, views and seconds."""
     yield from (
         "## Gain of the second view by scene",
         "",
@@ -414,7 +417,10 @@ def _probe(tables: Sequence[Sequence[Mapping[str, str]]], run: Run) -> Iterator[
 
 
 def _with_interval(row: Mapping[str, str], column: str) -> str:
-    """Return an estimate with its 95 % interval. A negative estimate has no interval above 0."""
+    """Return an estimate with its 95 % interval.
+
+    If the estimate is negative, the text says that there is no interval.
+    """
     value, low, high = (row.get(f"{column}{end}", "") for end in ("", "_low", "_high"))
     # Tables from before 2026-11-25 contain [0, 0] in this case.
     if value and float(value) < 0.0 and not any(float(end) for end in (low, high) if end):

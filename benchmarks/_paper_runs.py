@@ -40,7 +40,7 @@ class Results:
     left_out: Mapping[str, tuple[Path, ...]] = field(default_factory=dict)
 
     def missing(self, arms: Sequence[str], scenes: Sequence[str] = ()) -> tuple[int, int]:
-        """Return the number of pairs (scene, seed) that the arms share, and of missing pairs."""
+        """Return two numbers: pairs (scene, seed) that the arms share, and missing pairs."""
         shared = frozenset.intersection(*(self.planned.get(arm, frozenset()) for arm in arms))
         wanted = {each for each in shared if not scenes or each[0] in scenes}
         ended = {
@@ -102,7 +102,7 @@ def _chosen(
     dict[str, frozenset[tuple[str, int]]],
     dict[str, tuple[Path, ...]],
 ]:
-    """Return for each arm the requested runs, the failed runs, and the other runs."""
+    """Return for each arm the requested, the failed and the unrequested runs."""
     runs: dict[str, dict[tuple[str, int], Run]] = {}
     failed: dict[str, frozenset[tuple[str, int]]] = {}
     left_out: dict[str, tuple[Path, ...]] = {}
@@ -133,7 +133,7 @@ def probe_rows(run: Run, file: str = PROBES) -> list[dict[str, str]]:
 def probed(
     run: Run, reading: Reading, rows: Sequence[Mapping[str, str]] | None = None
 ) -> float | None:
-    """Return a figure of a run's gradients, averaged over probes, or None if it is missing."""
+    """Return a statistic of a run's gradients, averaged over probes, or None if it is missing."""
     found = [
         number(row, reading.column)
         for row in (probe_rows(run) if rows is None else rows)

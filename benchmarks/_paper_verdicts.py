@@ -38,7 +38,7 @@ class Answer:
 
     Attributes:
         outcome: The verdict.
-        figure: Our figure with its interval, or an empty text.
+        figure: Our value with its interval, or an empty text.
         detail: Remarks on the verdict, or an empty text.
     """
 
@@ -146,7 +146,7 @@ def paired(
 
 
 def _of_gradients(probe: Probe, results: Results, margin: float) -> Contrast:
-    """Return a figure of the gradients, or its difference to another figure, run by run."""
+    """Return a statistic of the gradients, or its difference from another statistic, by run."""
     pairs = []
     for (scene, seed), run in sorted(results.runs.get(probe.arm, {}).items()):
         if probe.scenes and scene not in probe.scenes:
@@ -181,7 +181,7 @@ def figure_of(found: Contrast, *, signed: bool = True) -> str:
 
 
 def with_plain(pairing: Pairing, results: Results, found: Contrast) -> str:
-    """Return the figure, followed by the estimate of plain PSNR."""
+    """Return the value, followed by the estimate of plain PSNR."""
     text = figure_of(found)
     plain = paired(pairing, results, PLAIN)
     if not text or plain.estimate is None:
@@ -254,7 +254,7 @@ def outcome_of(expected: Expected, judgement: Judgement, found: Contrast) -> Out
 
 
 def _calculated(claim: Arithmetic, tables: Tables) -> Answer:
-    """Return the answer to a statement about shares of a gap, from the paper's own figures."""
+    """Return the answer to a statement about shares of a gap, from the paper's own values."""
     method = values(tables, claim.table, claim.method, "PSNR")
     base = values(tables, claim.table, claim.base, "PSNR")
     target = values(tables, claim.target_table, claim.target, "PSNR")

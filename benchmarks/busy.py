@@ -38,7 +38,7 @@ BUSY = "while True: pass"
 
 @contextmanager
 def beside(programs: int) -> Iterator[None]:
-    """Run this number of computing programs inside the block."""
+    """Run this number of computing programs while the block runs."""
     others = [subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(programs)]
     try:
         yield

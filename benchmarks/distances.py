@@ -32,7 +32,7 @@ from crossgrad_plugins.compare.run import Run
 
 @dataclass(frozen=True)
 class Band:
-    """Views of one folder at similar distances.
+    """A band: views of one folder at similar distances.
 
     Attributes:
         folder: The regime of the views.
@@ -64,11 +64,11 @@ def bands_of(capture: Capture, folders: Sequence[str], count: int) -> list[Band]
 
 @dataclass(frozen=True)
 class Probes:
-    """Figures of runs on views of another capture.
+    """Metric values of runs on views of another capture.
 
     Attributes:
         runs: Arm -> scene and seed -> run.
-        values: Folder of a run -> photo -> figure.
+        values: Folder of a run -> photo -> metric.
         bands: The bands of views.
         quantity: The quantity of the figures.
     """
@@ -131,10 +131,10 @@ class Probes:
 def figures_of(
     runs: Sequence[Run], capture: Capture, name: str, *, file: bool
 ) -> dict[Path, dict[str, float]]:
-    """Return folder of a run -> photo -> figure of its model, or of its PLY drawn on black.
+    """Return folder of a run -> photo -> metric of its model, or of its PLY drawn on black.
 
     Raises:
-        UserError: There is no such figure, or a run cannot be evaluated.
+        UserError: The metric does not exist, or a run cannot be evaluated.
     """
     measured = [
         {

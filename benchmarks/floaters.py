@@ -29,7 +29,7 @@ SMALLEST = 0.005
 
 
 def measured(setup: Setup, state: TrainState) -> EvaluationResult:
-    """Return the figures of the held-out views."""
+    """Return the metrics of the held-out views."""
     return evaluate(
         setup.scene.test_views,
         renderer(setup, state),

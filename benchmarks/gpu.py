@@ -57,13 +57,13 @@ Row = dict[str, Any]
 
 
 class Short:
-    """Measures cases in this process, and stores their figures in a file.
+    """Measures cases in this process, and stores the measurements in a file.
 
     Args:
         scene: SCENE.
         kept: The file, with one JSON line per case.
-        place: Scene, GPU and commit of the figures. Figures of another scene, GPU or commit are not
-            used.
+        place: Scene, GPU and commit of the measurements. Figures of another scene, GPU or commit
+            are not used.
     """
 
     def __init__(self, scene: Path, kept: Path, place: str) -> None:
@@ -76,11 +76,11 @@ class Short:
                 self._known[row.pop("case")] = row
 
     def known(self, case: Case) -> Row | None:
-        """Return the stored figures of a case, or None."""
+        """Return the stored measurements of a case, or None."""
         return self._known.get(self._key(case))
 
     def row(self, case: Case) -> Row:
-        """Return the figures of a case, or the reason of a failure, which is not stored."""
+        """Return the measurements of a case, or the reason of a failure, which is not stored."""
         if (known := self.known(case)) is not None:
             return known
         try:
@@ -184,7 +184,7 @@ def _row(case: Case, found: Row) -> Row:
 
 
 def rows_of(case: Case, run: Path | None, why: str) -> Iterator[Row]:
-    """Yield the figures of a long run at its stops, or the reason why they are missing."""
+    """Yield the measurements of a long run at its stops, or the reason why they are missing."""
     if run is None:
         yield _row(case, {"note": why})
         return
@@ -238,7 +238,7 @@ def theirs(
 
 
 def curve_rows(case: Case, run: Path | None) -> Iterator[Row]:
-    """Yield step, training seconds and PSNR of every evaluation of a long run, if it exists."""
+    """Yield step, training seconds and PSNR of every evaluation of an existing long run."""
     for row in [] if run is None else read_run(run).rows:
         shown = {name: row.get(name) for name in ("step", "train_seconds", "psnr")}
         yield {"run": case.name, **shown}

@@ -29,7 +29,7 @@ def package_of(module: str) -> str | None:
 
 
 def files() -> dict[Path, str]:
-    """Return file -> its package."""
+    """Return the package of each source file."""
     found = {}
     for path in sorted((ROOT / CORE).rglob("*.py")):
         found[path] = path.relative_to(ROOT / CORE).with_suffix("").parts[0]
@@ -39,7 +39,7 @@ def files() -> dict[Path, str]:
 
 
 def packages() -> dict[str, set[str]]:
-    """Return package -> the packages that it imports."""
+    """Return the packages that each package imports."""
     found = files()
     graph: dict[str, set[str]] = {package: set() for package in found.values()}
     for path, package in found.items():
@@ -68,7 +68,7 @@ def direct(graph: Mapping[str, set[str]]) -> dict[str, set[str]]:
 
 
 def layers(graph: Mapping[str, set[str]]) -> dict[str, int]:
-    """Return package -> its layer, one above the highest layer that it imports."""
+    """Return the layer of each package: one above the highest layer that the package imports."""
     found: dict[str, int] = {}
 
     def layer(package: str) -> int:

@@ -100,7 +100,7 @@ def _measured(
 def _work(
     operator: Operator, gradients: list[dict[str, Tensor]], out: dict[str, Tensor]
 ) -> dict[str, Callable[[], object]]:
-    """Return the functions that are timed, by the name of their figure."""
+    """Return the functions that are timed, by the name of the measured value."""
     work: dict[str, Callable[[], object]] = {
         "ratio": lambda: operator.aggregate(_context(_apart(gradients)), EMPTY_STATE),
         ADDITIONS: lambda: _add(gradients, out),

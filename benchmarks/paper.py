@@ -76,12 +76,12 @@ class Place:
         return self.out / grid
 
     def grid(self, grid: str) -> Path:
-        """Return the path of the grid that is run, with scenes and rates filled in."""
+        """Return the path of the grid that is run, with scenes and learning rates filled in."""
         return self.out / "grids" / f"{grid}.yaml"
 
     @property
     def tuned(self) -> Path:
-        """The grid with the best rates, as written by `crossgrad sweep --best`."""
+        """The grid with the best learning rates, as written by `crossgrad sweep --best`."""
         return self.out / "grids" / "tuned.yaml"
 
     def archive(self, grid: str) -> Path:
@@ -128,7 +128,7 @@ class Paper:
         return grid.model_copy(update={"seeds": tuple(seeds)}) if seeds else grid
 
     def grids(self) -> dict[str, Grid]:
-        """Return every measured grid in the form of its last run, or else of the repository."""
+        """Return every measured grid as it was last run, or else as it is in the repository."""
         found = {
             name: read_grid(path) if path.is_file() else self.source(name)
             for name in self.plan.grids
@@ -157,7 +157,10 @@ class Paper:
                 unpack(self.place.archive(name), self.place.sweep(name))
 
     def run(self) -> int:
-        """Tune, run unfinished runs, and write the page. Return the exit code."""
+        """Tune, run unfinished runs, and write the page.
+
+        Return the exit code.
+        """
         self.unpack()
         self.tell()
         worst = self._swept(self.plan.tuning, _as_mapping(self.source(self.plan.tuning)))
@@ -211,7 +214,7 @@ class Paper:
         }
 
     def _content(self, name: str, factors: Factors) -> dict[str, Any] | None:
-        """Return a grid with rates, or None if it has to wait for other grids."""
+        """Return a grid with learning rates, or None if the grid has to wait for other grids."""
         grid = self.source(name)
         if name == self.plan.best_of.grid:
             best = self._best(self.results(), self.grids())
@@ -294,7 +297,7 @@ def with_rates(grid: Grid, rates: Mapping[str, str], factors: Factors) -> Grid:
 
     Args:
         grid: A grid.
-        rates: Arm of the grid -> the tuned arm whose factors it uses.
+        rates: Arm of the grid -> the tuned arm whose factors the arm uses.
         factors: Tuned arm -> scene -> factor.
 
     Raises:

@@ -32,7 +32,7 @@ Poses = Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
 
 
 def poses_of(folders: Sequence[Path]) -> Poses:
-    """Return name -> [3, 3] rotation of world to camera, [3] centre, for all models."""
+    """Return rotation [3, 3] (world to camera) and centre [3] for each name, of all models."""
     found = {}
     for folder in folders:
         for image in pycolmap.Reconstruction(folder).images.values():
@@ -42,7 +42,10 @@ def poses_of(folders: Sequence[Path]) -> Poses:
 
 
 def errors_of(found: Poses, truth: Poses) -> tuple[dict[str, tuple[float, float]], float]:
-    """Return name -> (error as a share of the scene's size, angle in degrees), and this size."""
+    """Return two errors for each name, and the size of the scene.
+
+    The errors are a distance as a share of this size, and an angle in degrees.
+    """
     names = sorted(found.keys() & truth.keys())
     here = np.array([found[name][1] for name in names])
     there = np.array([truth[name][1] for name in names])

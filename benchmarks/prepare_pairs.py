@@ -58,7 +58,7 @@ class Pair:
 
 
 def intrinsics_of(folders: list[Path]) -> dict[str, Matrix]:
-    """Return name -> [3, 3] K for all models."""
+    """Return the matrix K [3, 3] for each name, of all models."""
     models = [pycolmap.Reconstruction(folder) for folder in folders]
     return {
         image.name: model.camera(image.camera_id).calibration_matrix()

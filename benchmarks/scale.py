@@ -116,7 +116,10 @@ class Noise:
 
 
 def groups(*, full: bool) -> Iterator[tuple[str, list[Cell]]]:
-    """Yield title and cells of each group. Cells are compared with the first of their group."""
+    """Yield title and cells of each group.
+
+    Cells are compared with the first cell of their group.
+    """
     base = Cell(20_000, 20_000)
     yield "unseen", [base, replace(base, gaussians=200_000)]
     yield "turning", [base, replace(base, gaussians=200_000, directions=10)]

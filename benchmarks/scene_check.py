@@ -125,7 +125,10 @@ def is_found(wrong: Wrong, verdict: Verdict) -> bool:
 
 
 def wrong_scene(path: Path, seed: int, size: int, steps: int | None) -> Outcome:
-    """Return the outcome of a scene that contradicts itself. It is trained if steps are given."""
+    """Return the outcome of a scene that contradicts itself.
+
+    The scene is trained if steps are given.
+    """
     rng = np.random.default_rng(seed)
     right = varied(base(path, size), rng)
     kind = list(KINDS)[seed % len(KINDS)]

@@ -42,7 +42,7 @@ def last_tenth(run: RunResults) -> tuple[list[float], list[float]]:
 
 
 def arm(run: RunResults) -> tuple[str, str, str, str]:
-    """Return scene, growth, and the rules at the end of a run."""
+    """Return scene, growth setting, and the rules that act at the end of a run."""
     rules = dict(run.config.get("rules") or {})
     tail, average = (rules.get(name) or {} for name in ("lr-tail", "weight-averaging"))
     fades, averages = (float(each.get("share", 0.0)) for each in (tail, average))

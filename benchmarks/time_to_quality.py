@@ -19,7 +19,8 @@ the held-out views in summary.json, such as `ssim`.
     python benchmarks/time_to_quality.py share OUT
 
 compares short runs with long runs of the same code. The share is the gain of the short run divided
-by the gain of the long run, in dB above a picture of the training photos' mean colour.
+by the gain of the long run; a gain is measured in dB above a picture of the training photos' mean
+colour.
 """
 
 import argparse
@@ -126,7 +127,7 @@ def _cases(given: argparse.Namespace) -> Iterator[tuple[int, Path, str]]:
 
 
 def _figures(folder: Path, judge: Path, *, independent: bool) -> Row:
-    """Return the figures of a run, with its PLY drawn on the held-out views of another run."""
+    """Return the metrics of a run, with its PLY drawn on the held-out views of another run."""
     if _held_out(folder) != _held_out(judge):
         raise SystemExit(
             f"{folder} and {judge} do not hold out the same views: give both a --split"
@@ -185,7 +186,7 @@ def table(given: argparse.Namespace) -> None:
 
 
 def _told(folder: Path, figure: str) -> float:
-    """Return a figure of a run, over all held-out views."""
+    """Return a metric value of a run, over all held-out views."""
     return float(json.loads((folder / "summary.json").read_text())["overall"][figure])
 
 
@@ -195,7 +196,10 @@ def _print_gains(
     old: Mapping[tuple[str, str], dict[int, Row]],
     figure: str | None,
 ) -> None:
-    """Print the gains of a code over `old`: by scene, and pooled over scenes of equal lengths."""
+    """Print the gains of a code version over `old`: by scene, and pooled.
+
+    Scenes with equal lengths of runs are pooled.
+    """
     gains: dict[str, dict[str, list[float]]] = defaultdict(dict)
     margin, digits = (0.005, 4) if figure == "ssim" else (0.1, 2)
     for (scene, lengths), codes in cases:
@@ -231,7 +235,7 @@ def _gain(each: Estimate, digits: int) -> Iterator[str]:
 
 
 def share(given: argparse.Namespace) -> None:
-    """Print the share of the gain of `long` over the mean colour that `new` reaches."""
+    """Print which share of the gain of `long` over the mean colour `new` reaches."""
     by_case: dict[tuple[str, str, int], dict[str, Row]] = defaultdict(dict)
     for path in sorted(given.out.glob("*/row.json")):
         row = json.loads(path.read_text())
@@ -252,7 +256,7 @@ def share(given: argparse.Namespace) -> None:
 
 
 def _first(lengths: str) -> float:
-    """Return the length of the first code's runs."""
+    """Return the length of the runs of the first code version."""
     return float(lengths.partition(" ")[0].split(":")[0])
 
 

@@ -126,7 +126,7 @@ class Plain:
 
 
 def beside(case: Path, other: Path, threads: int, rounds: int) -> dict[str, Any]:
-    """Return figures of alternating steps of this checkout and the other checkout."""
+    """Return times of alternating steps of this checkout and the other checkout."""
     core = 0 if threads == 1 else None
     workers = [Worker(HERE, case, threads, core), Worker(other, case, threads, core)]
     seconds: list[list[float]] = [[], []]
@@ -148,7 +148,7 @@ def beside(case: Path, other: Path, threads: int, rounds: int) -> dict[str, Any]
 
 
 def two_ways(case: Path, rounds: int) -> dict[str, Any]:
-    """Return figures of two threads in one process and of two simultaneous processes."""
+    """Return times of two threads in one process and of two simultaneous processes."""
     both = Worker(HERE, case, 2)
     apart = [Worker(HERE, case, 1, core) for core in (0, 1)]
     together, alone = [], []

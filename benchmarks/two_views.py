@@ -48,7 +48,7 @@ RATES = {"at the best rates": ", best", "at the published rates": ""}
 
 
 def differences(runs: Runs, ending: str) -> Iterator[str]:
-    """Yield the table of differences, by equal quantity and by regime."""
+    """Yield the table of differences, for equal steps, views or seconds, and by regime."""
     scenes = runs.scenes
     yield from head("two views minus one, at equal ...", "regime", *scenes, "pooled", "verdict")
     wanted = [

@@ -20,18 +20,18 @@ FLOOR = 1e-4
 def as_plain(
     gaussians: Gaussians, cameras: Sequence[Camera], blur: float, near: float
 ) -> Gaussians:
-    """Convert Gaussians so that plain rendering gives the same image as their own response.
+    """Convert Gaussians so that plain rendering and their own response give the same image.
 
     A response adds the variance `blur` to the 2-D covariance S and preserves the volume, that is
-    opacity times sqrt(det S). A viewer's dilation is larger than `blur`. The difference between
-    both values is subtracted from the 3-D variances beforehand; at depth z, a pixel is z / f local
-    units wide. With S' for the reduced S, the opacity is multiplied by sqrt(det S / det(S' +
-    dilation)), the ratio of footprints.
+    opacity times sqrt(det S). A viewer's dilation is larger than `blur`. Therefore the difference
+    between the dilation and `blur` is first subtracted from the 3-D variances. At depth z, a pixel
+    is z / f local units wide. With S' for the reduced S, the opacity is multiplied by sqrt(det S /
+    det(S' + dilation)), the ratio of footprints.
 
     The 3-D variances are computed for the camera with the finest pixels at a Gaussian. The opacity
-    is computed for the camera with the largest ratio. Means over the cameras would make Gaussians
-    too thin and too faint if they are near some cameras and far from others. A Gaussian that no
-    camera sees is unchanged.
+    is computed for the camera with the largest ratio. With means over the cameras instead, a
+    Gaussian near some cameras and far from others would be too thin and too faint. A Gaussian that
+    no camera sees is unchanged.
 
     Args:
         gaussians: Gaussians of another response.

@@ -54,7 +54,7 @@ COLORS = Conditioned("distance_f_dc", "f_dc", (1, 3, 2))
 def fitted_scale(cameras: Sequence[Camera]) -> Tensor:
     """Return [7] float64: mean centre, mean and 1 / standard deviation of log r, range of z.
 
-    The last three values are 0 for one camera and for equal distances.
+    The last three values are 0 if there is one camera or if all distances are equal.
     """
     centers = torch.stack([camera.center for camera in cameras])
     middle = centers.mean(0)
@@ -66,7 +66,7 @@ def fitted_scale(cameras: Sequence[Camera]) -> Tensor:
 
 
 def distinguished(scale: Tensor) -> bool:
-    """Return True if distances differ on a scale of `fitted_scale`."""
+    """Return True if the distances behind a result of `fitted_scale` differ."""
     return bool(scale[4] > 0)
 
 
@@ -83,9 +83,10 @@ def encoded(scale: Tensor, cameras: Sequence[Camera]) -> Tensor:
 
 
 def added(weights: Tensor, encoding: Tensor) -> Tensor:
-    """Return the sum [N, ...] that weights [N, ..., 2] add at an encoding [2].
+    """Return the terms [N, ...] that weights [N, ..., 2] add for an encoding [2].
 
-    This avoids a matrix product, because its rounding depends on the number of threads.
+    The code avoids a matrix product, because the rounding of a matrix product depends on the number
+    of threads.
     """
     products: Tensor = weights * encoding
     return products.sum(-1)
@@ -106,8 +107,8 @@ def penalty(weights: Tensor, l2: float, smoothness: float) -> Tensor:
     """Compute the penalty on weights [N, ..., 2]: sum per Gaussian, mean over the Gaussians.
 
     The penalty is `l2` times the squared weights, plus `smoothness` times the squared derivative of
-    w_1 z + w_2 z^2 by z, averaged over the training cameras. Over these cameras z has mean 0 and
-    variance 1, so the mean of (w_1 + 2 w_2 z)^2 is w_1^2 + 4 w_2^2.
+    w_1 z + w_2 z^2 with respect to z, averaged over the training cameras. Over these cameras z has
+    mean 0 and variance 1, so the mean of (w_1 + 2 w_2 z)^2 is w_1^2 + 4 w_2^2.
     """
     factors = torch.tensor([l2 + smoothness, l2 + 4 * smoothness]).to(weights, non_blocking=True)
     total: Tensor = (weights.square() @ factors).sum()
@@ -130,10 +131,11 @@ class DistanceConditioned(Vanilla):
     Gaussian adds w . D to its log scales (the same term for all three scales), to its opacity logit
     and to each coefficient of SH band 0, with separate weights w for each of them. The weights
     start at 0, so that the model equals vanilla bit for bit. Two penalties on the weights grow
-    linearly over the run: their squared length, and the squared derivative by z of the terms that
-    they add. Blocks: the blocks of vanilla, `distance_scales` [N, 1, 2], `distance_opacities` [N,
-    2], `distance_f_dc` [N, 1, 3, 2], and `distances` [7]. Source: the paper, Distance-Conditioned
-    Attributes; the encoding and the default values were chosen for crossgrad.
+    linearly over the run: their squared length, and the squared derivative, with respect to z, of
+    the terms that the weights add. Blocks: the blocks of vanilla, `distance_scales` [N, 1, 2],
+    `distance_opacities` [N, 2], `distance_f_dc` [N, 1, 3, 2], and `distances` [7]. Source: the
+    paper, Distance-Conditioned Attributes; the encoding and the default values were chosen for
+    crossgrad.
     """
 
     plain: ClassVar[bool] = False
@@ -186,7 +188,7 @@ class DistanceConditioned(Vanilla):
 
     @override
     def fitted_to(self, scene: Scene) -> tuple[Vanilla, tuple[str, ...]]:
-        """Leave out the conditions if all training cameras are equally far from their mean."""
+        """Leave out the distance terms if all training cameras are equally far away."""
         backbone, notes = super().fitted_to(scene)
         if distinguished(_scale_of(scene)):
             return backbone, notes

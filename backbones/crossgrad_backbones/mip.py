@@ -41,7 +41,7 @@ def filter_widths(means: Tensor, cameras: Sequence[Camera], near: float, *, pari
     """Return the standard deviation [N] of each Gaussian's filter, local units.
 
     The value is sqrt(VARIANCE) z / f, the minimum over the cameras that see the mean. Gaussians
-    that no camera sees get the largest width among all other Gaussians (0 if there are no others).
+    that no camera sees get the largest width of the seen Gaussians (0 if no Gaussian is seen).
 
     Args:
         means: [N, 3] local units.

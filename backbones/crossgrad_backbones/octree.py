@@ -74,8 +74,9 @@ def init_anchors(points: NDArray[np.float64], lattice: Lattice, *, everywhere: b
     Args:
         points: [P, 3] local units.
         lattice: The lattices.
-        everywhere: True to create an anchor at every site. False leaves out a site if it holds all
-            points of its coarser site, because its anchor would repeat the coarser anchor.
+        everywhere: True to create an anchor at every site. False leaves out a site that contains
+            all points of its coarser site, because the site's anchor would repeat the coarser
+            anchor.
     """
     origin = lattice.origin.numpy()
     levels = torch.arange(lattice.count)

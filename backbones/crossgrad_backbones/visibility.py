@@ -49,7 +49,7 @@ def _affine(columns: tuple[Tensor, Tensor, Tensor], row: Tensor) -> Tensor:
     """Return one coordinate [N] of transformed points.
 
     The coordinate is computed element by element. A matrix product may round a row differently at
-    another position, and values of a primitive must not change if other primitives are added or
+    another position. The values of a primitive must not change if other primitives are added or
     removed.
     """
     x, y, z = columns

@@ -42,7 +42,7 @@ def scale_camera(camera: pycolmap.Camera) -> None:
 
 
 def thin_tracks(source: pycolmap.Reconstruction) -> dict[int, list[tuple[int, int]]]:
-    """Return point id -> (image id, observation) pairs that are kept."""
+    """Return the kept pairs (image id, observation) for each point id."""
     kept = {}
     for point_id, point in sorted(source.points3D.items()):
         elements = sorted((e.image_id, e.point2D_idx) for e in point.track.elements)

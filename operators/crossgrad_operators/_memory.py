@@ -29,7 +29,10 @@ def recall(
 def remember(
     state: PluginState, context: OperatorContext, key: str, values: NDArray[np.float64]
 ) -> PluginState:
-    """Return the state with `values` [B, ...] under `key`. Rows follow their primitives."""
+    """Return the state with `values` [B, ...] under `key`.
+
+    If primitives move to other rows of their tensors, the stored values move with them.
+    """
     tensors, rows_of = dict(state.tensors), dict(state.per_primitive)
     if _by_block(context):
         tensors[key] = torch.from_numpy(values)
@@ -51,12 +54,15 @@ def _known(kept: torch.Tensor | None, shape: tuple[int, ...]) -> NDArray[np.floa
 
 
 def _by_block(context: OperatorContext) -> bool:
-    """Return whether each Gramian has its own block: few Gramians, and no name twice."""
+    """Return whether each Gramian has its own block: few Gramians, all names different."""
     blocks = context.blocks
     return len(blocks) <= _BLOCKS and len(set(blocks)) == len(blocks)
 
 
 def _runs(context: OperatorContext) -> Iterator[tuple[str, int]]:
-    """Yield each block's name and number of Gramians. Above 1, each Gramian is of a primitive."""
+    """Yield each block's name and number of Gramians.
+
+    A number above 1 means one Gramian per primitive.
+    """
     for name, run in groupby(context.blocks):
         yield name, sum(1 for _ in run)

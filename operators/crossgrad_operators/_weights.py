@@ -60,7 +60,7 @@ class CautiousKernel(Protocol):
 
 
 def doubted(kernel: CautiousKernel, gramians: Floats, context: OperatorContext) -> Floats:
-    """Return weights of 16 digits, or of 32 digits if the kernel finds them ill-conditioned."""
+    """Return weights of 16 digits, or of 32 digits if the 16-digit weights are ill-conditioned."""
     nothing = np.zeros_like(gramians)
     weights, ill_conditioned = kernel(gramians, nothing, context.present, context.unit, None)
 
@@ -86,8 +86,9 @@ class Kernel(Protocol):
 def extended_precision(kernel: Kernel, gramians: Floats, context: OperatorContext) -> Floats:
     """Return weights with as many digits as the gradients require.
 
-    Gradients finer than float32 get 32 digits if the residuals of their Gramians are known. Other
-    gradients get 16 digits, and 32 digits if the kernel finds their weights ill-conditioned.
+    Gradients with a type finer than float32 get 32 digits if the residuals of their Gramians are
+    known. Other gradients get 16 digits, and 32 digits if the kernel finds their weights
+    ill-conditioned.
     """
     if context.unit < FLOAT32 and context.rounding_residuals is not None:
         return kernel(gramians, context.rounding_residuals(), context.present, True)[0]

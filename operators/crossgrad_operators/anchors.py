@@ -23,7 +23,7 @@ class Anchors(GramianOperator):
     """`symmetric` between a nearest and a farthest view, and `sum` between other views.
 
     Use this operator with the sampler `anchors-30`: the nearest and the farthest 30 % of the
-    cameras are anchors. The cameras in between contribute plain photometric gradients.
+    cameras are anchors. The remaining cameras contribute plain photometric gradients.
     """
 
     views: ClassVar[ViewCounts] = ViewCounts(2, 2)

@@ -15,7 +15,7 @@ class Aligned(Weighting):
 
     G = V L V^T; w = sqrt(l_min) V L^-1/2 V^T p with p = 1/K and l_min the smallest eigenvalue above
     K eps l_max. If an eigenvalue falls below this limit, the result u is discontinuous: the
-    eigenvalue's direction is omitted, and l_min becomes the next larger eigenvalue.
+    eigenvalue's direction is omitted, so l_min becomes the next larger eigenvalue.
 
     Source: Senushkin et al. 2023, "Independent component alignment".
     """
@@ -55,10 +55,10 @@ class IMTLG(Weighting):
 class Nash(Weighting):
     """The bargaining solution: alpha > 0 with G alpha = 1 / alpha, u = sum alpha_k g_k.
 
-    Two views use a closed form. More views use damped Newton steps (decrement 1e-13). |u| would
-    always be sqrt(K). The solution is multiplied by the geometric mean of the norms, so that u
-    scales with the gradients and a single view is unchanged. The result is zero if the gradients
-    are exactly opposite.
+    Two views use a closed form. More views use damped Newton steps (decrement 1e-13). The length
+    |u| of the plain solution is always sqrt(K). The plain solution is multiplied by the geometric
+    mean of the norms. Therefore u scales with the gradients, and a single view is unchanged. The
+    result is zero if the gradients are exactly opposite.
 
     Source: Navon et al. 2022, "Multi-task learning as a bargaining game".
     """

@@ -1,4 +1,4 @@
-"""Projection onto the cone of directions that conflict with no gradient: UPGrad and DualProj."""
+"""Projection onto the cone of directions without a conflict: UPGrad and DualProj."""
 
 from typing import ClassVar
 
@@ -11,11 +11,11 @@ from crossgrad_operators._weights import extended_precision
 
 
 class UPGrad(GramianOperator):
-    """The mean of the gradients, each projected onto the cone that conflicts with no gradient.
+    """The mean of the gradients, each projected onto the cone of conflict-free directions.
 
     For each k: v_k = argmin v^T G v subject to v >= e_k / K; u is the sum of all v_k G. For two
-    views u is half of `symmetric`. Two views use a closed form. More views use the active sets of
-    Lawson and Hanson. Gradients in float64 use 32 digits.
+    views u is half of the result of `symmetric`. Two views use a closed form. More views use the
+    active sets of Lawson and Hanson. Gradients in float64 use 32 digits.
 
     Source: Quinton and Rey 2024, "Jacobian descent for multi-objective optimization".
     """
@@ -36,7 +36,7 @@ class UPGrad(GramianOperator):
 
 
 class DualProj(Weighting):
-    """The mean gradient, projected onto the cone that conflicts with no gradient.
+    """The mean gradient, projected onto the cone of conflict-free directions.
 
     v = argmin v^T G v subject to v >= 1/K; u = v G. Two views use a closed form. More views use the
     active sets of Lawson and Hanson. Gradients in float64 use 32 digits.

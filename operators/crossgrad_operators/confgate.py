@@ -17,14 +17,13 @@ _THRESHOLDS: Final = {"v2": 0.9, "low": 0.6}
 
 
 class ConfGate(GramianOperator):
-    """A projection of a pair only if it conflicts now and has probably conflicted for some time.
+    """Projects a pair only if the pair conflicts now and has probably done so for some time.
 
     The mean mu and the variance v of the block's cosine are exponential averages (bias-corrected)
-    with n_eff = (1 + beta) / (1 - beta) effective samples.
-    P(conflict) = Phi(-mu / sqrt(v / n_eff + 1e-12)).
-    The operator is `symmetric` if m < 0 and P >= tau, else `sum`. The first `warmup` updates of a
-    pair never project. Pairs with a zero gradient or without a common element (m = 0) are not
-    counted.
+    with n_eff = (1 + beta) / (1 - beta) effective samples. P(conflict) = Phi(-mu / sqrt(v / n_eff +
+    1e-12)). The operator is `symmetric` if m < 0 and P >= tau, else `sum`. A pair is not projected
+    in its first `warmup` updates. Pairs with a zero gradient or without a common element (m = 0)
+    are not counted.
     """
 
     identity_at_one: ClassVar[bool] = True

@@ -13,7 +13,7 @@ from crossgrad_operators._weights import Flags, Floats, extended_precision
 
 
 class MGDA(Weighting):
-    """The shortest convex combination of the gradients: min |sum w_k g_k|, w on the simplex.
+    """The shortest convex combination of the gradients: w minimizes |sum w_k g_k| on the simplex.
 
     Two views use a closed form. More views use the active sets of Lawson and Hanson. Gradients in
     float64 use 32 digits. |u| is at most the length of the shortest gradient. The result is zero
@@ -34,7 +34,7 @@ class MGDA(Weighting):
 
 
 class CAGrad(Weighting):
-    """The direction near the mean that maximizes the smallest gain over all views.
+    """The direction near the mean that maximizes the smallest decrease of a loss over all views.
 
     max over |d - g_0| <= c |g_0| of min_k g_k.d, g_0 the mean: d = g_0 + (c |g_0| / |g_w|) g_w,
     where w on the simplex minimises g_w.g_0 + c |g_0| |g_w|. Two views use a closed form. For more

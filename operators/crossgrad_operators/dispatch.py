@@ -59,8 +59,8 @@ def _as_mapping(rules: tuple[Rule, ...]) -> dict[str, object]:
 class Dispatch(GramianOperator):
     """A different operator for each block: from the block's rule, its kind's rule, or the variant.
 
-    Variants of the paper: `geometry-confgate` gates the geometry and adds the appearance.
-    `geometry-projection` projects the geometry and gates the appearance.
+    Variants of the paper: `geometry-confgate` uses `confgate` for the geometry and `sum` for the
+    appearance. `geometry-projection` projects the geometry and uses `confgate` for the appearance.
     """
 
     variant: Literal["geometry-confgate", "geometry-projection"] = Field(
@@ -118,7 +118,7 @@ class Dispatch(GramianOperator):
         return {**idle, **inner_idle(selection, "rules", [rule.operator for rule in self.rules])}
 
     def _given(self, selection: Selection) -> list[tuple[str, BlockKind]]:
-        """Return name and kind of the blocks that each Gramian covers."""
+        """Return name and kind of the blocks from which each Gramian is computed."""
         blocks = [(block.name, block.kind) for block in selection.backbone.trained_blocks()]
         if self.granularity != "kind":
             return blocks
@@ -182,7 +182,7 @@ class Dispatch(GramianOperator):
         return chosen | {rule.block: rule.operator for rule in self.rules}
 
     def _served(self, context: OperatorContext) -> NDArray[np.str_]:
-        """Return the key [B] of the rule for each Gramian."""
+        """Return for each Gramian the key of the rule that applies to it."""
         ruled = {rule.block for rule in self.rules}
         kind_of = {
             name: self._key(name, kind, ruled)

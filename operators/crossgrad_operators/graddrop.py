@@ -13,9 +13,9 @@ from crossgrad_core.plugin import AggregateContext, AggregateResult, Operator, P
 class GradDrop(Operator):
     """A random choice, in every element, between the positive and the negative gradients.
 
-    p is the sum of the positive magnitudes and n the sum of the negative magnitudes. The positive
-    gradients are kept with probability p / (p + n), else the negative gradients. All views share
-    one uniform random number per element. The expected result is `sum`.
+    p is the sum of the positive magnitudes and n the sum of the negative magnitudes. The operator
+    keeps the positive gradients with probability p / (p + n), and otherwise the negative gradients.
+    All views share one uniform random number per element. The expected result is `sum`.
     """
 
     identity_at_one: ClassVar[bool] = True

@@ -110,7 +110,10 @@ def _fresh(loss: float) -> dict[str, Any]:
 
 
 def _at(group: dict[str, Any], level: int, loss: float) -> dict[str, Any]:
-    """Return a group's losses at an octave, now its newest. Full size is stored in the group."""
+    """Return a group's losses at an octave, which becomes the group's newest octave.
+
+    The losses at full size are stored in the group itself.
+    """
     if level == 0:
         group.pop("octave", None)
         return group

@@ -18,7 +18,7 @@ class GradVac(GramianOperator):
 
     For each i, for j != i in random order: phi = cos(v, g_j); if phi < t_ij, v gets the multiple of
     g_j that raises the cosine to t_ij; then t_ij <- (1 - beta) t_ij + beta phi, clipped to +-0.999.
-    The targets start at 0, which gives PCGrad's rule. i and j are slots, not cameras.
+    The targets start at 0, so the first step follows PCGrad's rule.
     """
 
     identity_at_one: ClassVar[bool] = True

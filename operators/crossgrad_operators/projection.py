@@ -1,4 +1,4 @@
-"""Operators of pairwise projection: each gradient loses components that conflict with others."""
+"""Operators of pairwise projection: each gradient loses its conflicting components."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -16,7 +16,7 @@ NARROW = 1e-12
 
 
 class Symmetric(GramianOperator):
-    """A sum of gradients after conflicting pairs lose their components along each other.
+    """A sum of gradients: in conflicting pairs, each loses its component along the other gradient.
 
     g_1' = g_1 - (m / |g_2|^2) g_2 and g_2' = g_2 - (m / |g_1|^2) g_1 for m = g_1.g_2 < 0 (paper,
     equations proj_near, proj_far and final_update): two-task PCGrad. With more than two views,
@@ -63,7 +63,7 @@ class PCGrad(GramianOperator):
 
 
 class Soft(GramianOperator):
-    """Removal of `strength` times the component along g_j if cos(g_i, g_j) < -threshold.
+    """Remove `strength` times the component along g_j if cos(g_i, g_j) < -threshold.
 
     v -= strength (v.g_j / |g_j|^2) g_j. Threshold 0 and strength 1 equal `symmetric`, and strength
     0 equals `sum`. With a threshold above 0 the rule is discontinuous. Pairs are processed in the

@@ -47,8 +47,9 @@ class Sum(MatrixOperator):
 def divided_sum(context: AggregateContext, divisor: int) -> AggregateResult:
     """Return the sum of the views' gradients divided by `divisor`, without Gramians.
 
-    The counts are numbers of blocks: `zero` if the gradient of a view is exactly zero or absent,
-    `dropped` if the gradient of a view was left out because it is not finite.
+    The counts are numbers of blocks: `zero` counts blocks in which the gradient of a view is
+    exactly zero or absent. `dropped` counts blocks in which the gradient of a view was left out
+    because it is not finite.
     """
     gradients = context.gradients
     finite, present = gradients.finite(), gradients.present()

@@ -30,7 +30,7 @@ def _pairs(value: object) -> object:
 class TorchJD(GramianOperator):
     """w = Weighting(G / trace G), for the weighting classes of torchjd.aggregation.
 
-    G is divided by its trace because TorchJD compares it with absolute thresholds. Views without a
+    G is divided by its trace because TorchJD compares G with absolute thresholds. Views without a
     gradient are left out of G. Weightings that store earlier steps are refused, because their
     memory could not be resumed.
     """

@@ -1,4 +1,4 @@
-"""Conversion of neural Gaussians to plain ones: the mean over the cameras that see an anchor."""
+"""Conversion of neural Gaussians to plain Gaussians by means over cameras."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class ColorFit:
 
     Attributes:
         products: [P, k, 4, 4] weighted sums of basis times basis.
-        colors: [P, k, 4, 3] weighted sums of basis times colour, less 1/2.
+        colors: [P, k, 4, 3] weighted sums of basis times (colour - 1/2).
     """
 
     products: Tensor
@@ -70,7 +70,7 @@ BAKED_CAMERAS = 32
 
 
 def evenly(cameras: Sequence[Camera], most: int) -> list[Camera]:
-    """Return at most `most` of the cameras, evenly spaced in their order."""
+    """Return at most `most` cameras, evenly spaced in their order."""
     count = min(len(cameras), most)
     return [cameras[i * len(cameras) // count] for i in range(count)]
 
@@ -138,7 +138,9 @@ def baked(
     views: Sequence[tuple[Camera, Seen]],
     code: Tensor | None = None,
 ) -> Gaussians:
-    """Convert anchors to plain Gaussians: for each anchor the mean over the cameras that see it.
+    """Convert anchors to plain Gaussians.
+
+    The result for an anchor is the mean over the cameras that see the anchor.
 
     Opacities are averaged with 0 for cameras that do not draw a Gaussian. Scales, rotations and
     colours are averaged with the opacities as weights; colours use spherical harmonics up to band

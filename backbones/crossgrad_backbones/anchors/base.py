@@ -121,7 +121,7 @@ class Used:
 
     Attributes:
         mask: [P] bool.
-        factor: [P] in [0, 1], factor of the anchors' opacities; None for 1.
+        factor: [P] in [0, 1], factor of the anchors' opacities; None if all factors are 1.
     """
 
     mask: Tensor

@@ -38,10 +38,11 @@ class _Back:
     """Gradient sums over the anchors, and buffers for a stretch of anchors.
 
     Attributes:
-        heads: The heads (opacity, covariance, colour) with a gradient, without gaps.
+        heads: The heads (opacity, covariance, colour) that receive a gradient; they follow one
+            another without a gap.
         features: [Q, F] sum.
-        first: Sums of the first layers.
-        second: Sums of the second layers of `heads`, concatenated.
+        first: Gradient sums of the first layers.
+        second: Gradient sums of the second layers of `heads`, concatenated.
         raw: [n, outputs of all heads] gradient with respect to the raw outputs.
         hidden: [n, H of all heads] gradient with respect to the hidden layers.
     """
@@ -111,12 +112,12 @@ def backward(inputs: Inputs, kept: Kept, given: Gradients) -> Gradients:
     Args:
         inputs: Inputs of the forward pass.
         kept: Values that the forward pass saved.
-        given: Gradients of means, quaternions, scales, opacities and colours; None is zero.
+        given: Gradients of means, quaternions, scales, opacities and colours; None means zero.
 
     Returns:
         Gradients of features, offsets, log scales, weight and bias of the first layers, and of each
         second layer. If only the scales have a gradient (volume regularisation), the gradients of
-        the offsets and of the other two networks are None and cost nothing.
+        the offsets and of the other two networks are None and are not computed.
     """
     alone = all((gradient is not None) == (i == _SCALES) for i, gradient in enumerate(given))
     back = _Back.of(inputs, kept, (_COVARIANCE,) if alone else _HEADS)

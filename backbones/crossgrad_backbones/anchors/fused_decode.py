@@ -32,7 +32,7 @@ class View:
     Attributes:
         positions: [P, 3].
         rows: [A] int64, the anchors that are seen, without duplicates.
-        factor: [A] factor of the anchors' opacities; None for 1.
+        factor: [A] factor of the anchors' opacities; None if all factors are 1.
         views: [A, V] direction (and distance) from the camera.
         feature_rows: [A] int64, the row of each anchor's feature, without duplicates.
     """

@@ -108,7 +108,7 @@ class Heads:
 
     @cached_property
     def networks(self) -> tuple[Network, ...]:
-        """The networks of opacity, covariance and colour, then the feature bank's if enabled."""
+        """The networks of opacity, covariance, colour and (if enabled) the feature bank."""
         outputs = (self.offsets, COVARIANCE * self.offsets, _CHANNELS * self.offsets)
         codes = (0, 0, self.code)
         three = tuple(
@@ -132,7 +132,7 @@ class Heads:
         return views if any(self.far) else views[:, :DIRECTION]
 
     def mixed(self, parameters: Mapping[str, Tensor], features: Tensor, views: Tensor) -> Tensor:
-        """Mix features [A, F] read at every fourth, second and first index (repeated to F)."""
+        """Mix the features [A, F], read at strides 4, 2 and 1 and repeated to F."""
         first, first_bias, second, second_bias = self.networks[-1].layers(parameters)
         hidden = linear(views, first, first_bias).relu()
         shares = torch.softmax(linear(hidden, second, second_bias), 1)
@@ -147,7 +147,7 @@ class Heads:
 
         Args:
             parameters: The parameters.
-            code: [C] appearance code, or None. The code is equal for all anchors and is added to
+            code: [C] appearance code, or None. The code is the same for all anchors and is added to
                 the bias.
         """
         weights, biases = [], []
@@ -204,7 +204,7 @@ class Seen:
 
     Attributes:
         rows: [A] int64 rows of the anchors, without duplicates.
-        factor: [A] in [0, 1], factor of the opacities of each anchor; None for 1.
+        factor: [A] in [0, 1], factor of the opacities of each anchor; None if all factors are 1.
     """
 
     rows: Tensor
@@ -255,8 +255,8 @@ def activated(
 def product(left: Tensor, right: Tensor) -> Tensor:
     """Return the product [a, b] of left [n, a] transposed and right [n, b]; n % `PANEL` is 0.
 
-    The sum is computed panel by panel. The libraries split one long sum over all threads, so the
-    bits would depend on the number of threads.
+    The sum is computed panel by panel. Matrix libraries split one long sum over all threads, so the
+    rounding of the sum depends on the number of threads.
     """
     first, second = (torch.unflatten(matrix, 0, (-1, PANEL)) for matrix in (left, right))
     return torch.bmm(first.transpose(1, 2), second).sum(0)

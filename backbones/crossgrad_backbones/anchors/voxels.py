@@ -61,7 +61,7 @@ def in_reach(cells: Tensor) -> Tensor:
 
 
 def numbered(cells: Tensor) -> Tensor:
-    """Return numbers [N] int64 that are equal exactly for equal cells [N, 3].
+    """Return numbers [N] int64 that are equal if and only if the cells [N, 3] are equal.
 
     Columns are numbered one by one so that no product overflows. This is much faster than `unique`
     of whole rows.

@@ -37,7 +37,8 @@ def root_cell(edge: float, base_layer: int, wanted: float) -> float:
 class Lattice:
     """Cubic lattices, one per level, each `fork` times finer than the level before (Octree-GS).
 
-    All fields are float64 tensors, so that a step does not wait for a device to read them.
+    All fields are float64 tensors, so that a training step need not wait until a device has sent
+    them to the host.
 
     Attributes:
         origin: [3] corner of the lattices, local units.
@@ -120,7 +121,10 @@ class Lattice:
         return (levels == 0) | (distances <= farthest)
 
     def _forks(self, exponents: Tensor) -> Tensor:
-        """Return fork^exponents in the exponents' type, because a step computes it per anchor."""
+        """Return fork^exponents in the number type of `exponents`.
+
+        A step computes this value for every anchor.
+        """
         # Do not use exp2: its rounding depends on the number of threads.
         return torch.exp(torch.log(self.fork) * exponents)
 
@@ -148,8 +152,8 @@ class Lattice:
     def keep_levels(self, shares: Tensor) -> Tensor:
         """Return a mask [A] of the anchors that are not pruned, by their share of cameras.
 
-        Anchors that every camera sees always stay. Otherwise, an automatic threshold (the mean
-        share) would remove all anchors if all cameras are equally far away.
+        Anchors that every camera sees always stay. Otherwise, if all cameras are equally far away,
+        the option that prunes by the mean share would remove all anchors.
         """
         return (shares > self.visible_share) | (shares >= 1.0)
 
@@ -184,7 +188,9 @@ def number_of_levels(largest: float, smallest: float, fork: int) -> int:
 
 
 def bounding_range(points: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the lowest coordinate, equal for all axes, and the edge of the cube (Octree-GS).
+    """Return the lowest corner and the edge of a cube around all points (Octree-GS).
+
+    The corner is one number, because its three coordinates are equal.
 
     The bounds are 1.1 times the smallest and the largest coordinate of all points and axes. If all
     coordinates are equal, the edge is 0.
@@ -206,7 +212,10 @@ def automatic_root_cell(points: NDArray[np.float64]) -> float:
 
 
 def root_above(middle_cell: float, levels: int, fork: int) -> float:
-    """Return level 0's edge if cells below the middle level are `middle_cell` (Octree-GS)."""
+    """Return the cell edge of level 0 (Octree-GS).
+
+    With this edge, cells of level `levels // 2 - 1` have the edge `middle_cell`.
+    """
     return middle_cell * float(fork) ** (levels // 2 - 1)
 
 

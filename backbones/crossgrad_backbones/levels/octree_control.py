@@ -61,11 +61,11 @@ def requests(
     request: GrowthRequest,
     thresholds: Thresholds,
 ) -> Requests:
-    """Return the cells that the offsets request.
+    """Return the cells that the offsets request for new anchors.
 
     An offset of an anchor of level l requests a cell if its gradient reaches the threshold of level
-    l. The cell is the one around its Gaussian: on level l + 1 if that level exists and the gradient
-    reaches its threshold, else on level l.
+    l. The offset requests the cell around its Gaussian: on level l + 1 if that level exists and the
+    gradient reaches the threshold of that level, else on level l.
     """
     levels = parameters["levels"]
     asks = request.eligible & (request.gradient >= thresholds.at(levels)[:, None])
@@ -147,7 +147,7 @@ _LENGTH, _FROM, _UNTIL, _EVERY = 40_000, 1500, 25_000, 100
 class OctreeControl(AnchorDensifier):
     """A densifier that adds anchors on the requesting level or, at larger gradients, on the next.
 
-    Pruning follows Scaffold-GS; no candidate is dropped at random. Anchors whose offsets have large
+    Pruning follows Scaffold-GS. No candidate is dropped at random. Anchors whose offsets have large
     mean gradients are afterwards seen from slightly farther away. Differences from the published
     code:
 
@@ -156,7 +156,7 @@ class OctreeControl(AnchorDensifier):
       after the last.
     - Each anchor is tested once per edit for its extra level, against the threshold of its own
       level. The published code tests all anchors against the threshold of every level in turn and
-      adds all results.
+      adds up the results.
     - The next level receives anchors even if it is still empty; in the published code an empty
       level stays empty.
     - If both levels request a cell in one edit, the cell uses the features of its own level.

@@ -28,7 +28,7 @@ class Clip(Observer):
     def crossgrad_aggregate_gradients(
         self, context: AggregateContext
     ) -> Generator[None, AggregateResult, AggregateResult]:
-        """Let the operator answer, then replace its answer."""
+        """Let the operator aggregate, then clip its result."""
         aggregated = yield
         gradients, clipped = dict(aggregated.gradients), 0
         for block in context.blocks:

@@ -1,4 +1,4 @@
-"""Tests of the wrapper's effect on the operator's answer."""
+"""Tests of the wrapper's effect on the operator's result."""
 
 import pytest
 import torch

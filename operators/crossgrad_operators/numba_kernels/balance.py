@@ -72,8 +72,8 @@ def _of_present(
 def _graded(norms: Pairs, cosines: Pairs, exact: Exact) -> Pairs:
     """Return D C D [n, n], where D contains the norms divided by the largest norm.
 
-    The matrix has the rank of C. The eigenvalues of the matrix itself would not show this rank at
-    large norm ratios.
+    The matrix has the rank of C. At large norm ratios, the eigenvalues of D C D would not show this
+    rank.
     """
     n = len(norms)
     longest, _ = longest_of(norms)
@@ -106,8 +106,8 @@ def _add_solution(
 ) -> None:
     """Add x_i (x_i.r) / l_i for the chosen eigenvectors x_i and eigenvalues l_i to `v`.
 
-    An eigenvector is skipped if the terms of x_i.r cancel up to a share `least`, because it is then
-    orthogonal to r except for rounding noise.
+    An eigenvector is skipped if the terms of x_i.r cancel up to a share `least`, because the
+    eigenvector is then orthogonal to r except for rounding noise.
     """
     for i in chosen:
         inner = products(vectors[:, i], right, 0, len(v), exact)
@@ -184,7 +184,10 @@ def imtl_g(
 def _same_shares(
     norms: Pairs, cosines: Pairs, places: Indices, unit: float, weights: Floats, exact: Exact
 ) -> bool:
-    """Fill in the weights of more than two views, and return True if they are ill-conditioned."""
+    """Fill in the weights of more than two views.
+
+    Return True if these weights are ill-conditioned.
+    """
     n = places.size
     longest, _ = longest_of(norms)
     scaled, v, x = np.empty((n, 2)), np.zeros((n, 2)), np.empty((n, 2))
@@ -228,10 +231,10 @@ def bargain(cosines: Floats, beta: Floats) -> bool:
 
     Return False if the iteration diverges.
 
-    The objective 1/2 beta^T C beta - sum log beta is self-concordant, so steps of
-    1 / (1 + decrement) converge from any start. In units of beta the Hessian is 1 + B C B, so no
-    damped step removes a whole beta. If a sum of directions with non-negative weights is zero, beta
-    grows without limit.
+    The objective 1/2 beta^T C beta - sum log beta is self-concordant, so steps of 1 / (1 +
+    decrement) converge from any start. In units of beta the Hessian is 1 + B C B, so a damped step
+    never makes a component of beta zero. If a sum of directions with non-negative weights is zero,
+    beta grows without limit.
 
     Args:
         cosines: [n, n].

@@ -1,4 +1,4 @@
-"""Projection onto the cone of directions that conflict with no gradient (UPGrad, DualProj)."""
+"""Projection onto the cone of directions without a conflict (UPGrad, DualProj)."""
 
 import numpy as np
 
@@ -33,7 +33,7 @@ from crossgrad_operators.numba_kernels.polyhedron import (
 def _pair(cosine: float, base: Pairs, z: Pairs) -> None:
     """Fill in coefficients z [2] of the projection of b [2].
 
-    At most one coefficient is larger than in b.
+    At most one coefficient becomes larger than its value in b.
     """
     one, other = base[0, 0], base[1, 0]
     first, second = one + cosine * other, cosine * one + other

@@ -1,7 +1,8 @@
 """Arithmetic with one or two float64 numbers: the same algorithms with 16 and with 32 digits.
 
-A number is a pair (high, low). `exact` is True for 32 digits and None for 16 digits, where only the
-high part is used. None and True have different types, so Numba compiles the two cases separately.
+A number is a pair (high, low). `exact` is True for 32 digits and None for 16 digits. With 16
+digits, only the high part is used. None and True have different types, so Numba compiles the two
+cases separately.
 """
 
 from typing import Final, Literal

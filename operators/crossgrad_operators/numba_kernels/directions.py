@@ -30,7 +30,7 @@ Solved = tuple[Floats, Flags]
 def directions(
     gramian: Floats, remainder: Floats, present: Flags, norms: Pairs, cosines: Pairs, exact: Exact
 ) -> int:
-    """Fill in norms [K] and cosines [K, K], with zeros for views that are not present.
+    """Fill in norms [K] and cosines [K, K]; they are zero for views that are not present.
 
     Args:
         gramian: [K, K].

@@ -71,9 +71,9 @@ def solve(matrix: Floats, chosen: Indices, count: int, right: Floats, out: Float
 def solve_shifted(matrix: Floats, right: Floats, out: Floats) -> None:
     """Solve (1 + M) x = r for positive semi-definite M by Cholesky.
 
-    The pivots of 1 + M are at least 1. If a computed pivot is smaller because of rounding, M is so
-    large that the summand 1 does not matter. In this case x is still finite and, because the factor
-    is regular, not an ascent direction.
+    The pivots of 1 + M are at least 1. If rounding makes a computed pivot smaller, M is so large
+    that the summand 1 does not matter. In this case x is still finite and, because the factor is
+    regular, not an ascent direction.
 
     Args:
         matrix: [n, n] M.

@@ -1,4 +1,4 @@
-"""Limits for rounding noise in norms and cosines, which are valid for any ratio of norms."""
+"""Limits for rounding noise in norms and cosines; the limits are valid for any ratio of norms."""
 
 import numpy as np
 from numpy.typing import NDArray

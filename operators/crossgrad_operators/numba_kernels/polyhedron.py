@@ -4,12 +4,12 @@ The nearest point to sum b_k e_k is sum (b_k + y_k) e_k with y >= 0, where a mul
 positive only if x.e_k = h_k. MGDA, CAGrad, UPGrad and DualProj all need such points. If the e_k are
 linearly dependent, the multipliers are not unique, but the point is unique.
 
-The matrix of cosines is known up to rounding, which leaves its smallest eigenvalues unknown.
+The matrix of cosines is known only up to rounding, so its smallest eigenvalues are unknown.
 Therefore a ridge is added to the diagonal of the matrix, which makes the matrix definite. The ridge
 bounds the multipliers and makes them continuous functions of the cosines. If the effect of the
 ridge matters, the step is repeated from its own result (proximal point iteration). At the end, the
-component along an eigenvector of eigenvalue l lacks only the share (ridge / (l + ridge))^ROUNDS.
-Directions that are far from linearly dependent need no second round.
+component along an eigenvector with eigenvalue l is too small only by the share (ridge / (l +
+ridge))^ROUNDS. Directions that are far from linearly dependent need no second round.
 """
 
 from typing import NamedTuple
@@ -56,8 +56,8 @@ class Rounding(NamedTuple):
             visible in gradients with half the digits.
         slack: A constraint is violated if its violation exceeds this share of its terms.
         shown: The ridge is corrected if it exceeds this share of a pivot.
-        noise: Rounding error of |sum x_k e_k|^2, as a share of sum x_k^2. The noise is also the
-            difference between gradients with half the digits that were meant to be opposite.
+        noise: Rounding error of |sum x_k e_k|^2, as a share of sum x_k^2. Gradients with half the
+            digits that were meant to be opposite differ by the same amount.
     """
 
     exact: Exact
@@ -273,7 +273,7 @@ def approach(problem: Polyhedron) -> int:
 
 @strict_device
 def is_settled(problem: Polyhedron) -> bool:
-    """Return True if the ridge is not visible, because active directions are far from dependent.
+    """Return True if the ridge has no visible effect: active directions are far from dependent.
 
     The function also sets `ill_conditioned` if the directions require more digits.
     """

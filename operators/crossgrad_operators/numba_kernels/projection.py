@@ -92,7 +92,7 @@ def projected(
         rounding_residuals: [B, K, K] rounding residuals of the Gramians, unused for 16 digits.
         present: [B, K].
         order: [K, K] order of the partners of each i, where i itself is skipped.
-        gates: [B, K, K] True if i may be projected along j.
+        gates: [B, K, K] True if gradient i may be projected against gradient j.
         rule: Threshold, 0 or more, and strength, from 0 to 1.
         exact: True for 32 digits, None for 16.
     """
@@ -129,7 +129,7 @@ def projected(
 
 @strict_device
 def _blur(v: Pairs, size: float, phi: float, t: float) -> float:
-    """Return the growth of the cosines' errors up to a target or up to the result."""
+    """Return the growth of the errors of the cosines, for the targets or for the result."""
     share = np.abs(v[:, 0]).max() / size
     steep = 1.0 + abs(t) / np.sqrt((1.0 - t) * (1.0 + t))
     across = max(np.sqrt((1.0 - phi) * (1.0 + phi)), 1e-6)

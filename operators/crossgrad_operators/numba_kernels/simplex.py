@@ -7,8 +7,8 @@ polyhedron {x: x.e_k >= level r_k}:
 
 - MGDA: at any level, the polyhedron's nearest point to 0 has the direction of the shortest
   combination.
-- CAGrad: the direction d with the largest min_k g_k.d in the ball of radius rho about g_0 is the
-  nearest point to g_0 at the level for which its distance from g_0 is rho.
+- CAGrad: let d be the direction with the largest min_k g_k.d in the ball of radius rho about g_0.
+  Then d is the point nearest to g_0 at the level for which this point has the distance rho.
 """
 
 from typing import NamedTuple
@@ -152,7 +152,11 @@ class Search(NamedTuple):
 
 @strict_device
 def _limits(search: Search) -> tuple[float, float]:
-    """Return the levels below which no constraint is active, and at which one is at rho."""
+    """Return two levels.
+
+    Below the first level, no constraint is active. At the second level, one constraint is at
+    distance rho.
+    """
     low, high = np.inf, np.inf
     for k in range(len(search.r)):
         q, r = search.q[k, 0], search.r[k, 0]
@@ -163,11 +167,11 @@ def _limits(search: Search) -> tuple[float, float]:
 
 @strict_device
 def _change(problem: Polyhedron, count: int, search: Search, level: Pair, ridge: float) -> Pair:
-    """Return the level change that moves the nearest point on the active face to distance rho.
+    """Return the change of level that moves the nearest point on the active face to distance rho.
 
     With the slope a = C^-1 r of the multipliers, the squared distance is a quadratic function of
-    the change. The change is infinite if no constraint is active, or if the rounding error of huge
-    multipliers exceeds the distance.
+    the change. The change is infinite if no constraint is active, or if huge multipliers have a
+    rounding error larger than the distance.
     """
     exact, slope = problem.rounding.exact, problem.step
     substitute(problem, count, search.r, slope)
@@ -200,7 +204,7 @@ def _is_beyond_reach(problem: Polyhedron, search: Search) -> bool:
 
 @strict_device
 def _repeats(problem: Polyhedron, before: Flags) -> bool:
-    """Return True if the active constraints equal the last stored ones, and store them."""
+    """Return True if the active constraints equal the stored constraints; store the active ones."""
     same = True
     for k in range(before.size):
         same &= before[k] == problem.active[k]
@@ -255,10 +259,10 @@ def _reach(problem: Polyhedron, search: Search) -> None:
 
 @strict_section
 def _defined(problem: Polyhedron, search: Search) -> float:
-    """Return the share of CAGrad's direction that is defined, and keep the multipliers.
+    """Return the share of CAGrad's direction that is defined, and leave the multipliers unchanged.
 
-    The direction is undefined if 0 is a convex combination of the gradients, so that no level above
-    0 can be reached, and if level 0 is within the distance. In this case many directions are
+    The direction is undefined if level 0 is within the distance and 0 is a convex combination of
+    the gradients. In this situation no level above 0 can be reached. Many directions are then
     equally good.
     """
     largest, rho = 0.0, search.rho[0][0]
@@ -283,10 +287,10 @@ def _defined(problem: Polyhedron, search: Search) -> float:
 
 @strict_device
 def _cagrad_pair(n1: float, n2: float, cosine: float, c: float) -> tuple[float, float, float]:
-    """Return the weight of g_1 in g_w, |g_w| and |g_0| (g_0 the mean of both), for 1 = n1 >= n2.
+    """Return the weight of g_1 in g_w, |g_w| and |g_0| (g_0 is the mean), for norms 1 = n1 >= n2.
 
     The objective (a - b) x / 2 + c |g_0| sqrt(D (x - x_0)^2 + h^2) is convex in x. Sums of squares
-    are arranged so that only the cosine itself can cancel. The returned weight belongs to the
+    are arranged so that only the cosine itself can cancel. The function returns the weight of the
     longer gradient, because this weight may be tiny.
     """
     product = n1 * n2

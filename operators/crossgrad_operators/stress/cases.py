@@ -1,4 +1,4 @@
-"""Inputs of the suite: K gradients that are short enough for exact sums, or periodic."""
+"""Inputs of the suite: K gradients that are periodic, or short enough for exact sums."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -131,7 +131,7 @@ def _at_cosine(cosine: float, first: float, second: float) -> Rows:
 
 
 def _angles() -> Iterator[Case]:
-    """Yield cases with cosines close to -1 and +1, where eps is the sine."""
+    """Yield cases with cosines close to -1 and +1; eps is the sine of the angle."""
     for eps in (1e-2, 1e-4, 1e-5):
         yield short(f"cos -1 + {eps**2 / 2:.0e}", [[1.0, 0.0], [-1.0, eps]])
         yield short(f"cos 1 - {eps**2 / 2:.0e}", [[1.0, 0.0], [1.0, eps]])

@@ -136,7 +136,7 @@ def complementary(matrix: Matrix, offset: Sequence[Number]) -> Vector | None:
 
     The algorithm of Lawson and Hanson is used, and each result is checked. The most violated
     constraint becomes active. If the column of this constraint depends on the active columns, an
-    active constraint is removed first, so M may be singular. None is returned if there is no
+    active constraint is removed first. Therefore M may be singular. None is returned if there is no
     solution.
     """
     mp = require_mpmath().mp

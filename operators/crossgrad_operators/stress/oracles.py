@@ -1,8 +1,8 @@
 """Reference implementations (oracles) of all methods in 50 digits, from their formulas.
 
-An oracle receives the exact Gramian of the views with a gradient, and returns their weights.
-Thresholds that belong to our definition of a method also belong to its oracle: exact opposition up
-to 1 + cos = 1e-12, and the eigenvalue floor of Aligned-MTL.
+An oracle receives the exact Gramian of the views with a gradient, and returns their weights. The
+oracles use the thresholds that are part of our definition of a method: exact opposition up to 1 +
+cos = 1e-12, and the eigenvalue floor of Aligned-MTL.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -38,8 +38,8 @@ class Question:
         options: Options of the operator.
         labels: [n] group labels.
         ratios: [n] camera distances divided by the reference distance.
-        rng: A generator in the same state as the operator's generator.
-        memory: Values that the oracle stored in the last step. The oracle may change the stored
+        rng: A generator that draws the same numbers as the operator's generator.
+        memory: Values that the oracle stored in the last step. The oracle may change these stored
             values.
     """
 
@@ -230,7 +230,7 @@ def confgate(question: Question) -> Vector:
 
 
 def _believed(question: Question, pair: tuple[int, int], cosine: Number) -> bool:
-    """Return True if a pair has probably been in conflict, including this step's cosine."""
+    """Return True if a pair has probably been in conflict; the cosine of this step is included."""
     mp, options = require_mpmath().mp, question.options
     beta = number(options["beta"])
     tau = {"v2": 0.9, "low": 0.6}[options["variant"]] if options["tau"] is None else options["tau"]

@@ -80,7 +80,7 @@ class Facts:
 
     @cached_property
     def distance(self) -> float:
-        """Distance of zero from the convex hull of the directions g_k / |g_k|.
+        """Distance from the origin to the convex hull of the directions g_k / |g_k|.
 
         Raises:
             UnprovenError: The nearest point of the hull was not found.
@@ -103,7 +103,9 @@ class Facts:
 
     @property
     def partial(self) -> float:
-        """The sum of |w_1 g_1 + w_2 g_2|, ..., |u| and all |w_k g_k|, over max(|u|, max |w_k g_k|).
+        """The sum of |w_1 g_1 + w_2 g_2|, ..., |u| and all |w_k g_k|, relative to a length.
+
+        This length is max(|u|, max |w_k g_k|).
 
         The value bounds the rounding errors of all products and additions, in units of u kappa.
         """
@@ -119,17 +121,20 @@ class Facts:
 
 
 def default_bound(facts: Facts) -> float:
-    """Return 8, or more if the rounding of the weighted sum plus 2 for the weights exceeds 8."""
+    """Return 8, or the rounding of the weighted sum plus 2 for the weights if this is larger."""
     return max(PROMISED, facts.partial + 2.0)
 
 
 def pairwise_bound(facts: Facts) -> float:
-    """Return the default bound, doubled in float64, where Gramians are as coarse as gradients."""
+    """Return the default bound, doubled in float64.
+
+    In float64, Gramians are as coarse as gradients.
+    """
     return default_bound(facts) * (1.0 if facts.unit > FLOAT64 else 2.0)
 
 
 def views_bound(facts: Facts) -> float:
-    """Return one per view, at least 8, because sums of equal signs never become shorter."""
+    """Return one unit per view, at least 8, because sums of equal signs never become shorter."""
     return max(PROMISED, float(len(facts.norms)))
 
 
@@ -144,14 +149,20 @@ def determined(facts: Facts) -> bool:
 
 
 def clear(facts: Facts) -> bool:
-    """Return True if `determined` holds, and directions are dependent exactly or not nearly."""
+    """Return True if `determined` holds and no directions are nearly dependent.
+
+    Exactly dependent directions are allowed.
+    """
     return determined(facts) and not _any_between(
         [*facts.sines, *facts.dependence], DEPENDENT, INDEPENDENT
     )
 
 
 def independent(facts: Facts) -> bool:
-    """Return True if `determined` holds, and more than two directions are not nearly dependent."""
+    """Return True if `determined` holds and no directions are nearly dependent.
+
+    With one or two directions, dependence is not tested.
+    """
     several = len(facts.norms) > 2  # noqa: PLR2004
     return determined(facts) and not (
         several and _any_between(facts.dependence, DEPENDENT, REGULAR)
@@ -159,12 +170,15 @@ def independent(facts: Facts) -> bool:
 
 
 def comparable(facts: Facts) -> bool:
-    """Return True if `clear` holds, and norm ratios are at most 1e8 if zero is in the hull."""
+    """Return True if `clear` holds.
+
+    If the hull of the directions contains the origin, norm ratios must also be at most 1e8.
+    """
     return clear(facts) and (facts.ratio <= COMPARABLE or facts.distance >= APART)
 
 
 def hull_apart(facts: Facts) -> bool:
-    """Return True if zero is not near the hull of the directions."""
+    """Return True if the hull of the directions is not near the origin."""
     return facts.distance >= APART
 
 

@@ -120,7 +120,7 @@ def compared(
     views: Views,
     memory: dict[Any, Any],
 ) -> Finding:
-    """Compare a result with its reference. The oracle may change the memory."""
+    """Compare a result with its reference. The oracle may change the values that it stored."""
     expected: Answer | ElementRule | None = reference.rule
     try:
         if reference.oracle is not None:

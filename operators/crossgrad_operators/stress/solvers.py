@@ -1,9 +1,9 @@
 """Oracles in 50 digits that solve small optimization problems.
 
 The operators use active sets in float64, on cosines that a ridge makes definite. The oracles use
-exact active sets. Every result is checked against the optimality conditions; they have only one
-solution, so the result is the minimum. If the gradients are linearly dependent, the weights are not
-unique, and the weights of independent gradients are returned.
+exact active sets. Every result is checked against the optimality conditions. These conditions have
+only one solution, so the result is the minimum. If the gradients are linearly dependent, the
+weights are not unique, and the weights of independent gradients are returned.
 """
 
 from collections.abc import Sequence
@@ -165,8 +165,8 @@ def _rough_bargain(cosine: Matrix) -> Vector:
 def _is_hopeless(cosine: Matrix, beta: Vector) -> bool:
     """Return True if the convex combination beta / sum beta proves that the result is zero.
 
-    x is this combination and u the sum of the bargain, with |u|^2 = K. Then sum x_k / beta_k =
-    sum x_k e_k.u is at most |sum x_k e_k| sqrt K, and so is the inverse of the largest beta.
+    x is this combination and u the sum of the bargain, with |u|^2 = K. Then sum x_k / beta_k = sum
+    x_k e_k.u is at most |sum x_k e_k| sqrt K. The inverse of the largest beta has the same bound.
     """
     share = form(cosine, beta) / sum(beta) ** 2
     return bool(len(beta) * share <= 2 * number(OPPOSITE) / len(beta))
@@ -315,7 +315,7 @@ def _found(
 
 
 def _change(cosine: Matrix, y: Vector, r: Vector, gap: Number) -> Number | None:
-    """Return the level change that closes the gap of the squared distance on the active face."""
+    """Return the change of level that closes the gap of the squared distance on the active face."""
     mp = require_mpmath().mp
     support = [k for k, v in enumerate(y) if v > 0]
     a = solve(cosine, support, r) if support else None

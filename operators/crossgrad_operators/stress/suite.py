@@ -72,7 +72,7 @@ def homogeneity(operator: Operator) -> float | None:
 
 
 def permutation(operator: Operator) -> float | None:
-    """Return the error after two views, with their labels and distances, exchange their order."""
+    """Return the error after two views change places, together with their labels and distances."""
     if not operator.views.admits(2):
         return None
     case, views = _rows(2), sample_views(2)
@@ -83,7 +83,10 @@ def permutation(operator: Operator) -> float | None:
 
 
 def one_view(operator: Operator) -> float | None:
-    """Return the change of a single view at the reference distance; the view should not change."""
+    """Return the change of a single view at the reference distance.
+
+    An operator should not change the view, so the expected value is 0.
+    """
     if not operator.views.admits(1):
         return None
     case = _rows(1)
@@ -92,7 +95,10 @@ def one_view(operator: Operator) -> float | None:
 
 
 def size(operator: Operator) -> float | None:
-    """Return the error for a gradient repeated 3,001 times, compared with the repeated result."""
+    """Return the error for a gradient that is repeated 3,001 times.
+
+    The reference is the result for the short gradient, repeated as often.
+    """
     if not isinstance(operator, MatrixOperator):
         return None
     worst = 0.0

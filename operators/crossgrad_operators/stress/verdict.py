@@ -97,7 +97,7 @@ def judge(
 
 
 def by_law(exact: ExactCase, found: Tensor, error: float, promise: Promise = ALL) -> Finding:
-    """Judge the distance of a result from the nearest result that a rule or a law allows."""
+    """Judge a result by its distance from the nearest result that a rule or a law allows."""
     longest = sqrt(float(max(exact.gramian[k][k] for k in range(exact.case.views))))
     scale = max(longest, float(found.double().norm()))
     return _measured(exact.case, error, (scale, scale), promise.bound(facts_of(exact)))

@@ -55,7 +55,7 @@ def check_package(package: str) -> tuple[str, bool]:
 
 
 def _strays_of(package: str) -> list[Stray]:
-    """Return the entry points of a package in groups that do not exist."""
+    """Return the entry points of a package whose group does not exist."""
     return [stray for stray in strays() if _normalized(stray.distribution) == _normalized(package)]
 
 

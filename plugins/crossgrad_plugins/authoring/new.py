@@ -64,7 +64,7 @@ def test_contract(check):
 
 @cache
 def examples() -> dict[str, tuple[Path, str]]:
-    """Return slot -> module and member of its plugin in the example package."""
+    """Return for each slot the module and the member of its plugin in the example package."""
     folder = next(folder for folder in _EXAMPLES if folder.is_dir())
     project = tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     slots = {group: slot for slot, group in OFFERED.items()}
@@ -102,7 +102,7 @@ def write_package(name: str, slot: str, folder: Path) -> tuple[Path, ...]:
 
 
 def _contents(name: str, module: str, slot: str) -> dict[str, str]:
-    """Return path below the folder -> text."""
+    """Return the text of each file, by its path below the folder."""
     kind = "".join(word.capitalize() for word in name.split("-"))
     member = module if slot == COMMANDS else kind
     example, model = examples()[slot]

@@ -52,7 +52,7 @@ _MOST_SHOWN: Final = 3
 
 
 def differing_code(arms: Mapping[str, Runs]) -> list[str]:
-    """Return a note if arms, or the two runs of a pair, come from different code; otherwise None.
+    """Return a note if arms, or the two runs of a pair, come from different commits or versions.
 
     A run without a recorded commit or version is ignored.
 
@@ -96,7 +96,7 @@ def _named(arms: list[str]) -> str:
 
 
 def _unlike_pairs(arms: Mapping[str, Runs]) -> Iterator[tuple[Run, Run]]:
-    """Yield two runs on one scene with one seed that come from different code."""
+    """Yield two runs on one scene with one seed that come from different versions of the code."""
     first_runs: dict[tuple[str, int], Run] = {}
     for runs in arms.values():
         for problem, run in runs.items():

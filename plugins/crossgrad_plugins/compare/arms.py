@@ -45,9 +45,9 @@ def arms_of(runs: Sequence[Run], failed: Sequence[Run] = ()) -> tuple[Arm, ...]:
 
     An arm contains the runs that agree in every setting that varies within a scene. A setting that
     differs only between scenes, such as a degree that the data of a scene cannot support, does not
-    separate arms. If every run has a label of a sweep, the runs of one label form an arm. If a
-    label covers several configurations on one scene, for instance after two sweeps, the settings of
-    the runs separate them.
+    separate arms. If every run has a label of a sweep, the runs with the same label form an arm. If
+    a label covers several configurations on one scene, for instance after two sweeps, the settings
+    of the runs separate the configurations.
 
     Args:
         runs: The finished runs; at least one.
@@ -139,9 +139,9 @@ def renamed(arms: Sequence[Arm], names: Sequence[str]) -> tuple[Arm, ...]:
 def _varying(runs: Iterable[Run]) -> tuple[str, ...]:
     """Return the settings with several values within a scene, the most important settings first.
 
-    A setting that only some runs have is ignored. Such a setting is either an option of a component
-    that the other runs do not use, so that the component itself differs, or belongs to another
-    version.
+    A setting that only some runs have is ignored. Such a setting either belongs to another version,
+    or is an option of a component that only some runs use; the component itself then distinguishes
+    the arms.
     """
     seen: dict[tuple[str, str], set[str]] = {}
     for run in runs:
@@ -232,19 +232,19 @@ class Cells:
         return any(len(by) > 1 for problems in self.runs.values() for by in problems.values())
 
     def at(self, length: Length) -> dict[str, dict[Problem, Run]]:
-        """Return arm -> scene and seed -> run of the given length."""
+        """Return the runs of the given length, by arm, and then by scene and seed."""
         return {
             arm: {problem: by[length] for problem, by in problems.items() if length in by}
             for arm, problems in self.runs.items()
         }
 
     def main(self) -> dict[str, dict[Problem, Run]]:
-        """Return arm -> scene and seed -> the run that represents them.
+        """Return the runs that represent each scene and seed, by arm, and then by scene and seed.
 
         The run has the length that is most frequent on its scene; of two equally frequent lengths,
-        the longer one is used. An arm uses another length if it has more than twice as many runs of
-        that length there. An arm without a run of the most frequent length uses its own lengths;
-        the longest run represents each scene and seed.
+        the longer one is used. An arm uses another length on a scene if it has more than twice as
+        many runs of that other length there. An arm without a run of the most frequent length uses
+        its own lengths; the longest run represents each scene and seed.
         """
         chosen = self._chosen()
         return {
@@ -271,7 +271,10 @@ class Cells:
         }
 
     def _chosen(self) -> dict[tuple[str, str], Length]:
-        """Return arm and scene -> the length used there; no entry without the usual length."""
+        """Return the length that is used for each arm and scene.
+
+        An arm without a run of the usual length has no entry.
+        """
         scene_counts: dict[str, Counter[Length]] = {}
         arm_counts: dict[tuple[str, str], Counter[Length]] = {}
         for arm, problems in self.runs.items():

@@ -38,7 +38,7 @@ def check_scenes(runs: Sequence[Run]) -> list[str]:
 
     Returns:
         Notes about two limits: runs whose photos cannot be compared, and scenes whose regimes
-            differ, so that only overall metrics are compared.
+            differ. For these scenes only overall metrics are compared.
 
     Raises:
         UserError: The metrics of these runs are not comparable; the message states the reason.
@@ -123,7 +123,7 @@ def _check_trained(scene: str, runs: Sequence[Run]) -> None:
 
 
 def _odd_one(runs: Sequence[Run], mark: Callable[[Run], Hashable]) -> tuple[Run, Run] | None:
-    """Return the first run and the first run with a different mark, or None."""
+    """Return the first run, and the first run whose mark differs from it, or None."""
     return next(((runs[0], run) for run in runs if mark(run) != mark(runs[0])), None)
 
 
@@ -235,7 +235,7 @@ def _check_definition(runs: Sequence[Run], key: str) -> None:
 
 
 def _definitions(runs: Sequence[Run], key: str) -> dict[str, str]:
-    """Return definition -> the first run that states it; runs without a definition are ignored."""
+    """Return the first run that states each definition; runs without a definition are ignored."""
     definitions: dict[str, str] = {}
     for run in runs:
         text = (run.summary.get("definitions") or {}).get(key)

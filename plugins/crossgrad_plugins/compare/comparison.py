@@ -43,7 +43,7 @@ class Comparison:
         unlike: Scenes whose runs assign different regimes to the same held-out views.
         target: The quality to reach; None for the final quality of the weakest arm, by scene.
         checked: Notes of the checks about results that are not compared, with the reasons.
-        unused: Folder of an unfinished or unreadable run -> why it is left out.
+        unused: Folder of an unfinished or unreadable run -> why the run is left out.
     """
 
     arms: tuple[Arm, ...]
@@ -58,7 +58,7 @@ class Comparison:
 
     @property
     def quantity(self) -> Quantity:
-        """The main figure."""
+        """The main metric."""
         return self.quantities[0]
 
     @cached_property
@@ -78,7 +78,7 @@ class Comparison:
 
     @cached_property
     def standing(self) -> Mapping[str, Mapping[str, Standing]]:
-        """Arm -> scene -> the main figure at the end."""
+        """Arm -> scene -> the main metric at the end of the runs."""
         return ranking.standings(self.main, self.quantity)
 
     @cached_property
@@ -93,12 +93,12 @@ class Comparison:
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
-        """Notes on figures and costs that are not compared, with the reason."""
+        """Notes on metrics and costs that are not compared, with the reason."""
         return (*self.checked, *_without(self.main, self.quantity))
 
     @cached_property
     def left_out(self) -> Mapping[str, str]:
-        """Folder -> why it is left out."""
+        """Folder -> why the folder is left out."""
         repeated = {name: f"repeats {kept}" for name, kept in self.cells.repetitions.items()}
         return {**self.unused, **repeated, **self.cells.unlike}
 
@@ -168,7 +168,10 @@ class Comparison:
 
     @cached_property
     def _telling(self) -> list[tuple[str, str]]:
-        """The pairs of arms in every table; with many arms, only the pairs of the best arm."""
+        """The pairs of arms that every table shows.
+
+        With many arms, these are only the pairs of the best arm.
+        """
         couples = pairwise.couples(self.ranking, self.baseline)
         few = self.baseline is not None or len(self.arms) <= _FEW_ARMS
         return couples if few else couples[: len(self.arms) - 1]
@@ -254,7 +257,7 @@ def _check_baseline(arms: Sequence[Arm], baseline: str | None) -> None:
 
 
 def _without(main: Mapping[str, Runs], quantity: Quantity) -> list[str]:
-    """Return notes on runs without a figure at their ends."""
+    """Return notes on runs that have no metric value at their ends."""
     notes = []
     for run in {run.name: run for by in main.values() for run in by.values()}.values():
         if run.final(quantity.name) is None:

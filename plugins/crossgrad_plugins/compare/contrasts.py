@@ -33,7 +33,7 @@ class Pair:
 
     @property
     def difference(self) -> float:
-        """The first minus the second."""
+        """The value of the first run minus the value of the second run."""
         return self.first - self.second
 
 
@@ -119,7 +119,10 @@ def judged(contrasts: Iterable[Contrast]) -> tuple[Contrast, ...]:
 
 
 def couples(ranking: Sequence[str], baseline: str | None) -> list[tuple[str, str]]:
-    """Return the pairs of arms to compare: all with the baseline, or each with all ranked below."""
+    """Return the pairs of arms to compare.
+
+    Each arm is compared with the baseline, or with every arm that is ranked below it.
+    """
     if baseline is not None:
         return [(name, baseline) for name in ranking if name != baseline]
     return [(a, b) for index, a in enumerate(ranking) for b in ranking[index + 1 :]]

@@ -262,7 +262,7 @@ def _config(results: "RunResults") -> dict[str, object]:
 
 
 def _labels(folder: Path) -> dict[str, tuple[str, ...]]:
-    """Return name of a run's folder -> its labels in its sweep; empty without a sweep.
+    """Return the labels in the sweep by name of the run's folder; empty without a sweep.
 
     A run that belongs to two configurations has both labels.
     """

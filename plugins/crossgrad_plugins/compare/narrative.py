@@ -72,7 +72,10 @@ def opposed_text(contrast: Contrast) -> str:
 
 
 def where_text(contrast: Contrast) -> str:
-    """Return the place of a contrast; a star marks runs that were compared before their ends."""
+    """Return the point or the views of a contrast.
+
+    A star marks runs that were compared before their ends.
+    """
     title = _TITLES.get(contrast.where)
     text = contrast.where if title is None else f"equal {title}"
     return f"{text} *" if contrast.inside else text
@@ -177,7 +180,7 @@ def _unpaired(comparison: Comparison) -> Sentence:
 def _of_the_best(comparison: Comparison) -> list[Sentence]:
     """Compare the arm with the best mean with the other arms.
 
-    This arm leads by its mean over runs; the estimate from pairs can differ from this mean.
+    The best arm is chosen by its mean over runs. The estimate from pairs can differ from this mean.
     """
     leader = comparison.ranking[0]
     with_leader = [

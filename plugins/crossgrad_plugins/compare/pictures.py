@@ -61,7 +61,7 @@ class WorstView:
 
 
 def worst_views(comparison: Comparison) -> dict[str, list[WorstView]]:
-    """Return scene -> its held-out views, the worst first, without pictures."""
+    """Return the held-out views of each scene, the worst first, without pictures."""
     by_scene: dict[str, list[WorstView]] = {}
     for scene in comparison.scenes:
         values: dict[tuple[str, str], dict[str, list[float]]] = {}
@@ -110,7 +110,10 @@ def with_pictures(
 
 
 def _runs_of(comparison: Comparison, scene: str) -> list[tuple[str, Run]]:
-    """Return the best arms on a scene, each with its run of the lowest seed that all share."""
+    """Return the best arms on a scene, each with one run.
+
+    All these runs have the lowest seed that the arms share.
+    """
     arms = [
         arm for arm in comparison.ranking if any(at == scene for at, _ in comparison.main[arm])
     ][:MOST_ARMS]

@@ -28,7 +28,7 @@ class Standing:
 def standings(
     runs: Mapping[str, Runs], quantity: Quantity, regime: str | None = None
 ) -> dict[str, dict[str, Standing]]:
-    """Return arm -> scene -> its metric; a scene is absent if no run has the metric there."""
+    """Return the metric by arm and scene; a scene is absent if no run has the metric there."""
     by_arm: dict[str, dict[str, Standing]] = {}
     for arm, by in runs.items():
         by_scene: dict[str, list[float]] = {}
@@ -46,7 +46,7 @@ def _standing(values: Sequence[float]) -> Standing:
 
 
 def scores(standing: Mapping[str, Mapping[str, Standing]]) -> dict[str, float]:
-    """Return arm -> its mean difference from the mean of all arms, averaged over its scenes.
+    """Return each arm's mean difference from the mean of all arms, averaged over its scenes.
 
     The difference is taken per scene, so an arm gains nothing by omitting a hard scene. The result
     is NaN without a metric.
@@ -72,7 +72,9 @@ def ranked(standing: Mapping[str, Mapping[str, Standing]], quantity: Quantity) -
 def noise(
     standing: Mapping[str, Mapping[str, Standing]], runs: Mapping[str, Runs]
 ) -> dict[str, tuple[float, int]]:
-    """Return scene -> standard deviation over seeds, pooled over arms, and its degrees of freedom.
+    """Return the standard deviation over seeds and its degrees of freedom, by scene.
+
+    The deviation is pooled over arms.
 
     Scenes with one seed per arm are left out, because their noise is unknown. Runs that represent
     two arms count once.

@@ -96,7 +96,10 @@ class Run:
         return value if value is not None and isfinite(value) else None
 
     def series(self, name: str, cost: Cost, regime: str | None = None) -> tuple[Array, Array]:
-        """Return the cost at each evaluation [n], ascending, and the figure at each of them [n]."""
+        """Return the costs [n] and the metric values [n] of the evaluations.
+
+        Costs are ascending.
+        """
         points = self.results.curve(name, regime, over=cost.column)
         values = {x: y for x, y in points if isfinite(x) and isfinite(y)}
         x = np.array(sorted(values), dtype=np.float64)
@@ -124,7 +127,7 @@ def text_of(length: tuple[str, float]) -> str:
 
 
 def settings_of(config: Mapping[str, Any]) -> Settings:
-    """Return setting -> value, for the settings that can separate arms.
+    """Return the values of the settings that can separate arms, by setting.
 
     A setting that is null counts as not set, and its value is `-`. A component becomes `backbone`,
     and its options become `backbone.sh_degree`. A chain of operators becomes `operator` with the

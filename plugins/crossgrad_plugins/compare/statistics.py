@@ -168,8 +168,8 @@ class Estimate:
         p_different: Two-sided p-value of no difference.
         p_equivalent: p-value of a difference of at least the margin (two one-sided tests).
         p_above: p-value of a difference of at least the margin upwards (a one-sided test).
-        needed: Number of pairs that would make the 90 % interval as narrow as the margin, if it
-            narrows as expected; None if this cannot be estimated.
+        needed: Number of pairs that would make the 90 % interval as narrow as the margin, if the
+            interval narrows as expected; None if this cannot be estimated.
         by_scene: The estimate of each scene; empty if all pairs are from one scene. The
             interquartile mean can hide a scene that differs from the other scenes.
     """
@@ -310,7 +310,7 @@ def verdicts(family: Sequence[Estimate]) -> list[Verdict]:
 
     The verdict is `different` if the 95 % interval excludes zero, else `equivalent` if the 90 %
     interval is within the margin. With more than five comparisons, the p-value of the test,
-    corrected with Holm's method, must also be below its level.
+    corrected with Holm's method, must also be below the level of the test.
     """
     if len(family) <= UNCORRECTED:
         return [_verdict(member.differs, member.is_small) for member in family]
@@ -343,8 +343,8 @@ def holm(values: Sequence[float]) -> list[float]:
 def opposed(found: Estimate, verdict: Verdict, margin: float) -> tuple[SceneEstimate, ...]:
     """Return the scenes whose own 95 % intervals contradict the verdict on all scenes.
 
-    A scene contradicts a difference if it differs in the other direction; it contradicts
-    equivalence if it is beyond the margin.
+    A scene contradicts a difference if its own difference has the opposite sign. A scene
+    contradicts equivalence if its difference is beyond the margin.
     """
     if verdict is Verdict.INCONCLUSIVE:
         return ()

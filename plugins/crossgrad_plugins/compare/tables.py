@@ -65,7 +65,7 @@ _ARM: Final = Column("arm", "arm")
 
 
 def standing_table(c: Comparison) -> Table:
-    """Return the arms from the best to the worst, with their figures and differences."""
+    """Return the arms from the best to the worst, with their metrics and differences."""
     reference = c.baseline or c.ranking[0]
     unit = f", {c.quantity.unit}" if c.quantity.unit else ""
     return Table(
@@ -302,7 +302,7 @@ def views_table(c: Comparison, scene: str, views: Sequence[WorstView]) -> Table:
 
 
 def csv_tables(c: Comparison, views: Mapping[str, Sequence[WorstView]]) -> dict[str, list[Row]]:
-    """Return file name -> rows, for each of `TABLES`."""
+    """Return the rows of each CSV file in `TABLES`, by file name."""
     contrasts = list(dict.fromkeys((*c.ends, *c.equal, *c.regimes, *c.others)))
     return {
         "runs.csv": [_run(c, arm.name, run) for arm in c.arms for run in arm.runs],

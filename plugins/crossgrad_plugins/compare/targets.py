@@ -54,7 +54,7 @@ class Reached:
 def targets_of(
     runs: Mapping[str, Runs], quantity: Quantity, given: float | None
 ) -> dict[str, float]:
-    """Return scene -> the quality to reach: the given one, or the median end of the weakest arm.
+    """Return the quality to reach on each scene: given, or the median end of the weakest arm.
 
     With an even number of runs, the worse of the two middle runs counts. More than half of the runs
     reach this quality, so the median of their costs is finite.
@@ -99,11 +99,11 @@ def reached(
 
 
 def ratios(rows: Sequence[Reached]) -> dict[str, list[float]]:
-    """Return arm -> its cost on each problem, divided by the smallest cost of all arms.
+    """Return the cost of each arm on each problem, divided by the smallest cost of all arms.
 
     A problem is a scene and a seed with a run of every arm. A run that never reaches the quality
-    has an infinite ratio and stays in the denominator. The same applies to all runs of a problem
-    that no arm solves.
+    has an infinite ratio and stays in the denominator. All runs of a problem that no arm solves
+    have an infinite ratio, too.
     """
     amounts: dict[str, dict[Problem, float]] = {}
     for row in rows:

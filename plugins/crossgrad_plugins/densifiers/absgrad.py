@@ -22,12 +22,13 @@ _THRESHOLDS: Final[Mapping[str, frozenset[str]]] = {
 class AbsGradDensityControl(AxisSplit):
     """Adaptive density control with absolute gradients, so opposite pixel gradients do not cancel.
 
-    In addition to the norm g of the projected mean's gradient, it sums the pixels' absolute
-    gradients, separately for x and y. The norm ga of these two sums is averaged over the renders in
-    which the Gaussian was visible. Criteria: `abs` clones by g and splits by ga (AbsGS). `gsplat`
-    clones and splits by ga alone. `quantile` clones and splits if g is above its threshold, or if
-    ga is among the equally many largest values; it uses the 1-norm instead of the 2-norm
-    (Mip-Splatting's code).
+    In addition to the norm g of the projected mean's gradient, the densifier sums the pixels'
+    absolute gradients, separately for x and y. The norm ga of these two sums is averaged over the
+    renders in which the Gaussian was visible. Criteria: `abs` clones by g and splits by ga (AbsGS).
+    `gsplat` clones and splits by ga alone. `quantile` clones and splits if g is above its
+    threshold, or if ga is among the N largest values, where N is the number of Gaussians with g
+    above its threshold. This criterion uses the 1-norm instead of the 2-norm (Mip-Splatting's
+    code).
     """
 
     needs = frozenset({"abs_gradient"})

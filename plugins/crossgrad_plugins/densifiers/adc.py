@@ -10,11 +10,11 @@ from crossgrad_plugins.densifiers.clone_split import AxisSplit, Growth
 
 
 class AdaptiveDensityControl(AxisSplit):
-    """Clones small and splits large Gaussians whose projected mean moves; prunes faint Gaussians.
+    """Clones small and splits large Gaussians with a large screen gradient; prunes faint Gaussians.
 
     The statistic of a Gaussian is a mean over the renders in which it was visible. The densifier
-    averages the norm of the loss gradient by the projected mean in NDC units (pixel gradient times
-    W/2, H/2). Each view contributes the gradient of its own loss.
+    averages the norm of the loss gradient with respect to the projected mean in NDC units (pixel
+    gradient times W/2, H/2). Each view contributes the gradient of its own loss.
     """
 
     grad_threshold: float = Field(

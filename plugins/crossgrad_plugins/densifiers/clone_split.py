@@ -54,7 +54,7 @@ class Growth:
     strength: Tensor
 
     def among(self, may_grow: Tensor | None) -> "Growth":
-        """Return the growth limited to primitives that may grow [P]; None: all may grow."""
+        """Return the growth limited to primitives that may grow [P]; None means all."""
         if may_grow is None:
             return self
         return replace(self, clone=self.clone & may_grow, split=self.split & may_grow)
@@ -192,7 +192,7 @@ class CloneSplit(Densifier):
     def pruned(
         self, context: DensifyContext, state: PluginState, plan: Plan, values: Mapping[str, Rows]
     ) -> Tensor:
-        """Return [M] bool, primitives of the plan to remove; by default the too faint or large."""
+        """Return [M] bool, primitives of the plan to remove; by default faint or large ones."""
         opacities = sigmoid(_planned(context, plan, values, "opacities"))
         pruned = opacities < self.prune_opacity
         if context.schedule.prunes_large(context.step):

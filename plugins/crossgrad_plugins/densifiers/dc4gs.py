@@ -91,7 +91,7 @@ class DirectionalConsistency(CloneSplit):
     R is the length of the mean direction of the pixels' gradients. ga is the norm of their absolute
     values. Both are computed per view; the product (1 - R) ga is averaged over the renders in which
     the Gaussian was visible. The children of a split are side by side on the longest axis. The cut
-    is at the position at which both sides are most consistent.
+    is at the position at which the gradients on each side of the cut agree most.
     """
 
     needs = frozenset({"directions"})

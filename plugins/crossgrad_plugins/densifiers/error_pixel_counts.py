@@ -209,7 +209,7 @@ def erroneous(view: RenderedView, threshold: float) -> Tensor:
 
 
 def drawn_views(columns: Sequence[int], number: int, rng: np.random.Generator) -> list[int]:
-    """Return random different views, evenly from all groups and at least one from each.
+    """Return random different views, evenly from all groups and at least one from each group.
 
     Args:
         columns: The group of each view, counted from 0.

@@ -41,8 +41,8 @@ def position_noise(
     """Return the rows of `means` that noise moves, and their shifts.
 
     shift = Sigma n sig(-100 (o - 0.005)) strength, with n three standard normal numbers. No number
-    is drawn for a Gaussian that would move by less than 1e-7 of its largest scale. This is the case
-    for every opaque Gaussian, so the noise costs little after the first steps of training.
+    is drawn for a Gaussian that would move by less than 1e-7 of its largest scale. Every opaque
+    Gaussian moves by less than that, so the noise costs little after the first steps of training.
 
     Args:
         parameters: Parameters with `scales` (log) [N, 3], `quats` [N, 4] and `opacities` (logit)
@@ -111,7 +111,8 @@ def shared_scale(opacity: Tensor, copies: Tensor) -> Tensor:
 
         D = 1/sqrt(2 pi) int 1 - (1 - o' exp(-x^2/2))^n dx.
 
-    This integrand is positive and smooth. The trapezoidal rule is accurate to rounding for it.
+    This integrand is positive and smooth. The trapezoidal rule integrates this function with an
+    error as small as rounding.
 
     Args:
         opacity: [R] float64 in [0, 1], before it is shared.

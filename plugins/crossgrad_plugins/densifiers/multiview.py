@@ -37,8 +37,8 @@ class MultiViewDensityControl(CountsMarkedPixels, AxisSplit):
 
     A Gaussian may grow if it is blended in more than `importance` erroneous pixels of a view on
     average. A primitive is cloned by the norm of its mean gradient, and split by the norm of its
-    absolute gradient. Only a share of the usual pruning candidates is removed; candidates are drawn
-    with weights that increase with their share in the error. After density control has ended,
+    absolute gradient. Only a share of the usual pruning candidates is removed. A candidate is drawn
+    with a weight that increases with its share in the error. After density control has ended,
     Gaussians that are faint or have nearly the largest error are removed at some points of the run.
     For anchors, use the densifier `multiview-gate`.
     """
@@ -143,7 +143,10 @@ class MultiViewDensityControl(CountsMarkedPixels, AxisSplit):
         return replace(edit, values=values, counts={**edit.counts, "capped": len(rows)})
 
     def _pruned_late(self, context: DensifyContext, state: PluginState) -> tuple[Edit, PluginState]:
-        """Remove faint primitives and primitives with nearly the largest error, if it is due."""
+        """Remove faint primitives and primitives with nearly the largest error.
+
+        This happens only in steps in which late pruning is due.
+        """
         schedule = context.schedule
         reached = schedule.counted(context.step) / schedule.length
         due = sum(share <= reached for share in self.late_prunings) if schedule.grows else 0

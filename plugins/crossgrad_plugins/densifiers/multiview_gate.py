@@ -52,8 +52,8 @@ class MultiViewGate(CountsMarkedPixels):
     """A densifier that lets another densifier grow only primitives with errors in several views.
 
     A primitive may grow if its Gaussians are blended in more than `importance` erroneous pixels of
-    a view on average. The other densifier decides how it grows and which primitives are pruned:
-    `anchor` or `octree` for anchors, any densifier that clones and splits for Gaussians.
+    a view on average. The other densifier decides how a primitive grows and which primitives are
+    pruned: `anchor` or `octree` for anchors, any densifier that clones and splits for Gaussians.
     """
 
     of: Annotated[Densifier, BeforeValidator(densifier_of), PlainSerializer(plain_component)] = (

@@ -84,8 +84,8 @@ def pixel_error(image: Tensor, decoded: tuple[Tensor, Tensor | None], kind: Erro
 def _shares(context: DensifyContext, gaussians: Gaussians, camera: Camera, error: Tensor) -> Tensor:
     """Return [N] sums over pixels of the Gaussian's blending weight times the pixel's error.
 
-    A pixel is the sum of weight times colour. The result is therefore the gradient, by the colour
-    of one channel, of the sum over pixels of image times error.
+    The value of a pixel is the sum of weight times colour. The result is therefore a gradient with
+    respect to the colour of one channel: the gradient of the sum over pixels of image times error.
     """
     colors = torch.zeros_like(gaussians.means, requires_grad=True)
     plain = replace(gaussians, colors=colors, sh_dc=None, sh_rest=None, sh_degree=0)

@@ -56,7 +56,10 @@ class Groups:
 
     @cached_property
     def divisors(self) -> tuple[float, float]:
-        """(N-1)/N of each group, from sample to population variance; 1 if N is unknown."""
+        """(N-1)/N of each group: the factor from sample variance to population variance.
+
+        It is 1 if N is unknown.
+        """
         if self.cameras is None:
             return 1.0, 1.0
         near, far = self.cameras

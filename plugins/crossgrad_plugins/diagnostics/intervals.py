@@ -71,8 +71,8 @@ class StudentisedGap:
     """The resamples of one block and the variance of its noise.
 
     Attributes:
-        draws: The resamples, with the sample itself in row 0; shifts are scaled as along the true
-            gap.
+        draws: The resamples, with the sample itself in row 0; shifts are scaled to their size along
+            the true gap.
         estimate: Unbiased estimate of the gap theta = ||near mean - far mean||^2.
         plain_gap: Squared distance of the sample means.
         floor: Variance of the estimate at theta = 0.
@@ -123,7 +123,10 @@ class StudentisedGap:
         return Pivot(observed, numerators / np.sqrt(_positive(variance[1:] + self.floors)))
 
     def ratio_pivot(self, ratio: float) -> Pivot:
-        """Return the studentised gap - ratio * sigma_w^2 and resamples, if `ratio` is true."""
+        """Return the studentised gap - ratio * sigma_w^2 and its resamples.
+
+        `ratio` is assumed to be the true ratio.
+        """
         draws = self.draws
         gap = ratio * float(draws.within[0])
         root = sqrt(gap)
@@ -155,7 +158,7 @@ def _along_the_true_gap(draws: Resamples, gap: float, floor: float) -> float:
 
     The sample gap d is the true gap plus noise, and the noise is largest in the directions in which
     gradients vary most. With the covariance Sigma of the difference of the means, noise adds
-    tr(Sigma^2), half of the `floor`, to d' Sigma d, and tr(Sigma) to |d|^2. Half of both is
+    tr(Sigma^2), half of the `floor`, to d' Sigma d, and tr(Sigma) to |d|^2. Half of each term is
     subtracted, or less if the whole gap could be noise, because the remainder is itself uncertain
     with a dozen views.
 

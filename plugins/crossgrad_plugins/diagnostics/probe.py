@@ -158,9 +158,9 @@ def _rows(model: Model, views: int, rng: np.random.Generator) -> tuple[Tensor | 
 def _divide_by_adam(model: Model, subset: _Subset, gradients: Sequence[_Gradients]) -> None:
     """Divide all gradients by the root of Adam's second moment after the next step.
 
-    The next step would first add the squared gradients to the moment. In this function the mean of
-    the squared gradients over the probed views is added, so that all views have the same metric.
-    This addition also bounds elements that training has never changed.
+    The next step would add the squared gradients to the moment before the division. This function
+    adds the mean of the squared gradients over the probed views instead, so that all views have the
+    same metric. This addition also bounds elements that training has never changed.
     """
     beta2 = model.rule.betas[1]
     for name, moment in model.adam.exp_avg_sq.items():

@@ -134,7 +134,10 @@ def _camera_lines(rows: Sequence[Row]) -> list[str]:
 
 
 def _grouping_lines(rows: Sequence[Row]) -> list[str]:
-    """Return the first block's figures by each grouping; the choice of near and far matters."""
+    """Return the first block's statistics for each grouping.
+
+    They depend on which views are near and which are far.
+    """
     lines = ["the same probe by grouping, plain metric"]
     for name in dict.fromkeys(str(row["grouping"]) for row in rows):
         first = next(row for row in rows if row["grouping"] == name)

@@ -80,8 +80,8 @@ class GroupResamples:
 class Resamples:
     """All values that the intervals need; row 0 is the sample itself, in units of the scale.
 
-    If theta is the true ||near mean - far mean||^2, a resample's estimate of it is theta +
-    2 sqrt(theta) `shift` + `noise`, minus the mean of the noise.
+    If theta is the true ||near mean - far mean||^2, a resample's estimate of theta is theta + 2
+    sqrt(theta) `shift` + `noise`, minus the mean of the noise.
 
     Attributes:
         within: [R + 1] sigma_w^2.

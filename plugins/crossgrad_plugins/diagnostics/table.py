@@ -24,8 +24,8 @@ from crossgrad_plugins.diagnostics.probe import Measurement
 class Conflict:
     """Conflict between near and far views, over all pairs of one near and one far view.
 
-    A pair counts for a block if both gradients are non-zero and overlap; disjoint gradients are
-    orthogonal without agreeing.
+    A pair counts for a block if both gradients are non-zero and overlap. Gradients without overlap
+    are orthogonal, but this does not mean that the views agree.
 
     Attributes:
         per_block: [B] share of the counted pairs whose dot product is negative; NaN without pairs.
@@ -72,7 +72,7 @@ def conflict(
 
 
 def _share(part: NDArray[np.int64], whole: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the quotient; NaN if the whole is empty."""
+    """Return part / whole; NaN if `whole` is 0."""
     return np.where(whole > 0, part / np.maximum(whole, 1), np.nan)
 
 

@@ -35,7 +35,7 @@ GROUPINGS = ("radial", "altitude", "footprint", "kmeans", "gmm")
 
 
 def distances_of(scene: Scene) -> dict[str, NDArray[np.float64]]:
-    """Return name -> [N] distances of the training views.
+    """Return distances [N] of the training views, by name of the distance.
 
     `radial`: distance from the mean camera, as in the paper. `depth`: median depth of the SfM
     points divided by the focal length, relative to the median view; only if every view sees points.
@@ -75,7 +75,10 @@ def camera_rows(scene: Scene) -> list[Row]:
 
 
 def grouping_rows(scene: Scene, measurement: Measurement, seed: int) -> list[Row]:
-    """Return the same probe by several groupings; give the reason if one cannot group the scene."""
+    """Return rows of one probe for several groupings.
+
+    If a grouping cannot group the scene, its row gives the reason.
+    """
     rows: list[Row] = []
     for name, labels, reason in _groupings(scene, seed):
         if reason:

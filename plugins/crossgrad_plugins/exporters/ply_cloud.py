@@ -77,7 +77,7 @@ class SplatCloud:
     def to_gaussians(self) -> Gaussians:
         """Return float32 Gaussians on the CPU with the bands that are in use.
 
-        Map a georeferenced cloud with `to_local` first, because float32 cannot represent its
+        Map a georeferenced cloud with `to_local` first, because float32 cannot represent map
         coordinates.
         """
         degree = self.sh_degree

@@ -71,7 +71,7 @@ _KNOWN: "WeakKeyDictionary[Scene, Mapping[str, float]]" = WeakKeyDictionary()
 
 
 def exposure_values(scene: Scene) -> Mapping[str, float]:
-    """Return name -> log2(t ISO / N^2) of all photos with EXIF exposure; read once per scene."""
+    """Return log2(t ISO / N^2) of all photos with EXIF exposure, by name; read once per scene."""
     by_name = _KNOWN.get(scene)
     if by_name is None:
         with ThreadPoolExecutor(_AT_ONCE) as pool:

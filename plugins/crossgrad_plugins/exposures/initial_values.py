@@ -126,7 +126,7 @@ def _reported_by(source: str, names: Sequence[str]) -> Iterable[str]:
 
 
 def outliers(names: Sequence[str], stops: Iterable[float]) -> Iterable[str]:
-    """Yield a message if photos are far from the mean, from each photo's stops."""
+    """Yield a message if the stops of some photos are far from the mean."""
     far = [name for name, stop in zip(names, stops, strict=True) if abs(stop) > _FAR]
     if far:
         yield (
@@ -182,7 +182,9 @@ class Neighbours:
         return of_near, of_regime
 
     def tell(self, values: _Floats) -> bool:
-        """Return True if neighbouring photos predict a photo's values better than its regime does.
+        """Return True if neighbouring photos predict a photo's values better than its regime.
+
+        The prediction of a regime is the mean of its values.
 
         With only two photos, return False.
         """

@@ -82,7 +82,7 @@ class ExposurePerPhoto(Exposure):
     def predict_unseen(
         self, view: View, scene: Scene, values: Mapping[str, Tensor]
     ) -> Mapping[str, Tensor]:
-        """Predict by EXIF if the view and training photos have it; else by neighbours or regime.
+        """Predict by EXIF if view and training photos have EXIF data; else by neighbours or regime.
 
         Neighbours are the training photos nearest in pose. The neighbours are used if they predict
         each other better than the mean over a regime does.

@@ -32,5 +32,8 @@ def encoded(light: Tensor) -> Tensor:
 
 
 def with_gain(image: Tensor, stops: Tensor) -> Tensor:
-    """Return the image [H, W, 3] with 2^stops times the light; one stop value, or one a channel."""
+    """Return the image [H, W, 3] with 2^stops times the light.
+
+    `stops` is one number, or one number per channel.
+    """
     return encoded(torch.exp2(stops) * decoded(image))

@@ -50,7 +50,7 @@ class Frame3D:
         return np.asarray(self.scale * (points @ self.rotation.T) + self.shift)
 
     def after(self, first: "Frame3D") -> "Frame3D":
-        """Return both similarities as one similarity: first `first`, then this one."""
+        """Return both similarities as one similarity: first `first`, then this similarity."""
         return Frame3D(
             self.rotation @ first.rotation,
             self.points(first.shift[None])[0],
@@ -77,8 +77,8 @@ SAME: Final = Frame3D(np.eye(3), np.zeros(3))
 def rotation_of(matrix: NDArray[np.float64]) -> NDArray[np.float64] | None:
     """Return the rotation [3, 3] nearest to a matrix; None if the matrix is not a rotation.
 
-    The matrix may deviate by the rounding of its digits. A matrix that is orthonormal to float64 is
-    returned unchanged.
+    The matrix may deviate by the rounding of its digits. A matrix that is orthonormal in the
+    precision of float64 is returned unchanged.
     """
     # Overflow and NaN also fail the test below.
     with np.errstate(over="ignore", invalid="ignore"):

@@ -24,7 +24,7 @@ _DIRECTIONS = 48
 
 
 def turned(gaussians: Gaussians, means: Tensor, rotation: Tensor) -> Gaussians:
-    """Return Gaussians with other centres [N, 3], each rotated by one rotation [3, 3] float64.
+    """Return Gaussians with new centres [N, 3]; all are rotated by one rotation [3, 3] float64.
 
     A camera that is moved in the same way sees the same image.
     """
@@ -48,7 +48,8 @@ def _harmonics_turn(rotation: Tensor, degree: int) -> Tensor:
     """Return the matrix [B, B], float64, that rotates coefficients of bands 1 to `degree`.
 
     The harmonics of a rotated direction are linear in the harmonics of the direction, with an
-    orthogonal matrix for each band. The matrix is fitted to their values in enough directions.
+    orthogonal matrix for each band. The matrix is fitted to the values of the harmonics in enough
+    directions.
     """
     directions = _directions()
     before, after = (

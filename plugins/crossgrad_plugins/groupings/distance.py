@@ -52,7 +52,7 @@ class Radial(Grouping):
 
 
 class Percentile(Grouping):
-    """near: cameras up to the q-th percentile of the distance from the mean camera; far: the rest.
+    """near: cameras up to the q-th percentile of the distance from the mean camera; else far.
 
     Balanced pairs then estimate (near mean + far mean) / 2 instead of the mean over cameras. If q
     is not 50, the estimate belongs to a different objective, and not only its variance differs.
@@ -127,7 +127,7 @@ def rule_by_shares(
     Args:
         scene: The scene.
         grouping: Name of the grouping, for messages.
-        share: Share of the training cameras on either side, at most 1/2.
+        share: Share of the near and share of the far training cameras, at most 1/2.
         needed: Labels that need training views.
 
     Raises:

@@ -31,7 +31,7 @@ from crossgrad_plugins.groupings.split import (
 
 
 class Footprint(Grouping):
-    """near: views that show a local unit with at least the median number of pixels; far: the rest.
+    """near: views that show a local unit with at least the median number of pixels; else far.
 
     The measure of a view is the median of f/z over the SfM points that the view observed. If the
     view observed fewer than three points, all SfM points in its image are used. If there are no

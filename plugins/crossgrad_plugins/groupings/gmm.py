@@ -32,8 +32,8 @@ class GaussianMixture(Grouping):
 
     If the fit is degenerate, the median is used (grouping `radial`), with a note. A fit is
     degenerate if a component weighs less than one camera, if it gets no camera, or if a number is
-    not finite. A camera at the mean of all cameras has no logarithm: it is near, and is left out of
-    the fit.
+    not finite. A camera at the mean of all cameras has no log-distance. This camera is near, and is
+    left out of the fit.
 
     Source: expectation maximisation (Dempster et al. 1977) in one dimension.
     """

@@ -31,7 +31,7 @@ def rule_of_distances(
             views.
 
     Raises:
-        UserError: There are no training views, or all views are on one side.
+        UserError: There are no training views, or all views are on one side of the threshold.
     """
     require_training_views(scene, grouping)
     train = radial_distances(scene, scene.train_views)

@@ -67,9 +67,9 @@ class Filled(Initializer):
     """Fills cells of photos that have no points, and a margin beyond all photos.
 
     The depth is a plane through the points that a photo observed, adjusted to the nearest points.
-    Cells beyond a photo's edge have the colour at the edge, and are filled if no training photo
-    shows them. Held-out photos and viewers then show a continued ground there instead of a black
-    hole. Ours.
+    Cells beyond a photo's edge are filled if no training photo shows them. They get the colour at
+    the edge. Held-out photos and viewers then show continued ground there instead of black holes.
+    This method was developed for crossgrad.
     """
 
     cells: int = Field(12, ge=2, le=200, description="points along the longer side of a photo")
@@ -189,7 +189,7 @@ def _spread(views: Sequence[View], most: int) -> list[View]:
 
 
 def _spacings(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return [P] distances of the points to their neighbours, as 3DGS sizes initial Gaussians."""
+    """Return [P] distances of the points to their neighbours, like the initial sizes of 3DGS."""
     from scipy.spatial import cKDTree
 
     count = min(_NEAREST, len(points) - 1)

@@ -172,7 +172,10 @@ def _spread(views: Sequence[View], most: int) -> list[View]:
 
 
 def _pairs(views: Sequence[View], neighbours: int) -> list[tuple[int, int]]:
-    """Return pairs of photos to compare: each photo with its nearest of similar direction."""
+    """Return pairs of photos to compare.
+
+    Each photo is paired with the nearest photos that look in a similar direction.
+    """
     centers = centers_of(views)
     axes = np.stack([view.camera.world_to_camera[2, :3].numpy() for view in views])
     pairs: set[tuple[int, int]] = set()
@@ -206,8 +209,9 @@ def _best(pairs: Sequence[tuple[int, int]], met: Sequence[Met]) -> list[tuple[in
 def meet(first: Features, second: Features, pixels: float) -> Met:
     """Return the features that two photos have in common, and their triangulated points.
 
-    Both descriptors are the nearest of each other by a clear margin. The point is in front of both
-    cameras. The projection of the point is at most `pixels` from the feature in both photos.
+    Two features match if each descriptor is by a clear margin the nearest of the other. The point
+    is in front of both cameras. The projection of the point is at most `pixels` from the feature in
+    both photos.
     """
     one, other = _matched(first.descriptors, second.descriptors)
     at = first.pixels[one], second.pixels[other]
@@ -224,7 +228,10 @@ def meet(first: Features, second: Features, pixels: float) -> Met:
 def _matched(
     first: NDArray[np.float32], second: NDArray[np.float32]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return rows of descriptors that are mutually nearest and clearly nearer than the second."""
+    """Return the rows of matching descriptors.
+
+    Two descriptors match if they are mutually nearest, and clearly nearer than the second-nearest.
+    """
     nothing = np.zeros(0, dtype=np.int64)
     if min(len(first), len(second)) <= 1:
         return nothing, nothing

@@ -51,7 +51,7 @@ def photometric_loss(
 
 
 class _FusedLoss(torch.autograd.Function):
-    """Computes the gradient by the image in the forward pass and scales it in the backward pass."""
+    """Computes the image's gradient in the forward pass, and scales it in the backward pass."""
 
     @staticmethod
     @override

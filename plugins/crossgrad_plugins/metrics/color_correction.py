@@ -29,8 +29,8 @@ Bytes = NDArray[np.uint8]
 class ColorCorrectedPSNR(Metric):
     """PSNR of the render after its colours are fitted to the photo (the metric uses the photo).
 
-    Compared with `psnr`, it separates errors of brightness and white balance from errors of the
-    scene.
+    Compared with `psnr`, this metric separates errors of brightness and white balance from errors
+    of the scene.
     """
 
     figure: ClassVar[Figure] = Figure(
@@ -57,7 +57,7 @@ class ColorCorrectedSSIM(Metric):
 
 
 def color_corrected(compared: Compared) -> Tensor | None:
-    """Return [H, W, 3] uint8: the render after the affine colour map that fits it to its photo.
+    """Return [H, W, 3] uint8: the render after the affine colour map that fits it to the photo.
 
     The map is fitted at unmasked pixels and applied everywhere. The result is None if no pixel
     counts.

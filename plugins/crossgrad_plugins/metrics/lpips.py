@@ -24,7 +24,7 @@ IN_UNIT_RANGE: Final = "images in [0, 1], as 3DGS feeds them"
 
 
 def figure_of(name: str, label: str, net: Trunk, entry: str, scaling: str) -> Figure:
-    """Return the figure of a metric without weights; `described` adds the source of the weights."""
+    """Return the `Figure` of LPIPS without weights; `described` adds the source of the weights."""
     return Figure(
         name=name,
         label=label,
@@ -39,8 +39,8 @@ def figure_of(name: str, label: str, net: Trunk, entry: str, scaling: str) -> Fi
 class Perceptual(Metric):
     """Learned perceptual similarity (LPIPS 0.1) with weights that the user provides.
 
-    The result is null without a trunk, because no Python package contains one. Nothing is ever
-    downloaded.
+    Without a trunk file the result is null, because no Python package contains a trunk. Nothing is
+    ever downloaded.
 
     Attributes:
         net: The network.

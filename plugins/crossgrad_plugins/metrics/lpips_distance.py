@@ -191,7 +191,10 @@ def _check(
 
 
 def _described(net: Trunk, path: Path) -> str:
-    """Return a text that identifies the file, because results of different files do not compare."""
+    """Return a text that identifies the file.
+
+    Results of different weight files cannot be compared.
+    """
     digest = sha256(path.read_bytes()).hexdigest()
     published = "" if digest.startswith(net.digest) else "not "
     return f"{path.name} (SHA-256 {digest[:16]}, {published}the file that torchvision publishes)"

@@ -71,7 +71,7 @@ def _closest(drawn: Tensor, compared: Compared) -> float | None:
 
 
 def _distances(lights: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean squared differences of brightnesses [L, N] in linear light from [N], as sRGB.
+    """Return the mean squared differences, in sRGB, between lights [L, N] and the wanted light [N].
 
     Values beyond white are clipped to white, as in the comparison of the render with the photo.
     """

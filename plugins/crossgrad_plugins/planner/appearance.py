@@ -64,7 +64,7 @@ def exposure(evidence: Evidence) -> Finding:
 
 
 def degree(evidence: Evidence) -> Finding:
-    """Decide the degree of spherical harmonics, by how colours depend on the direction."""
+    """Decide the degree of spherical harmonics from the dependence of colour on the direction."""
     part, config = "SH degree", evidence.config
     name = config.backbone.name
     of_bands = ("backbone.sh_degree", "backbone.lr_f_rest", "sh_from", "rules.sparse-sh")

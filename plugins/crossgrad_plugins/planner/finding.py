@@ -29,7 +29,7 @@ class Finding:
         evidence: The evidence as text, with its value.
         rule: The threshold.
         source: The source of the rule.
-        saved: The cost that the choice saves compared with a run that has the part.
+        saved: The cost that the choice saves compared with a run that uses the part.
         force: The option that sets another choice.
         figures: The values of the evidence.
         settings: The settings that change; empty if the choice is the default.

@@ -109,7 +109,10 @@ def _votes(model: "pycolmap.Reconstruction", path: Path) -> Votes:
 def _judged(
     model: "pycolmap.Reconstruction", database: "pycolmap.Database"
 ) -> Iterator[tuple[int, int, int, int]]:
-    """Yield for each pair of the model's photos their numbers, its matches and agreeing matches."""
+    """Yield the numbers of both photos, all matches and the agreeing matches of each pair.
+
+    Pairs are between photos of the model.
+    """
     import pycolmap
 
     poses = {number: model.image(number).cam_from_world() for number in model.reg_image_ids()}

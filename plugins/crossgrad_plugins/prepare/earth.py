@@ -80,7 +80,7 @@ def levelled(
     line: tuple[NDArray[np.float64], NDArray[np.float64]],
     tops: Mapping[str, NDArray[np.float64]],
 ) -> "pycolmap.Sim3d | None":
-    """Return the similarity rolled about a line so that photos are level; None if this is unclear.
+    """Return the similarity rolled about a line so that photos are level; None if unclear.
 
     Args:
         model: The model.

@@ -190,7 +190,7 @@ def _camera(plan: Plan, photos: Sequence[Photo]) -> "pycolmap.Camera":
 def _write_position(
     database: "pycolmap.Database", data: "pycolmap.data_t", position: NDArray[np.float64]
 ) -> None:
-    """Write a position in the local frame (east, north, up), as large coordinates lose digits."""
+    """Write a position in the local frame (east, north, up), because large numbers lose digits."""
     import pycolmap
 
     system = pycolmap.PosePriorCoordinateSystem.CARTESIAN

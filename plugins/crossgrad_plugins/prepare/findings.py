@@ -188,7 +188,7 @@ def bridges_of(
 
 
 def parts_of(plan: Plan, models: Sequence[frozenset[str]]) -> list[frozenset[str]]:
-    """Return the photos of each model, and photos that are missing with most of their folder."""
+    """Return the photos of each model, and the missing photos of mostly missing folders."""
     posed = frozenset().union(*models)
     missing: dict[str, set[str]] = defaultdict(set)
     sizes: Counter[str] = Counter(photo.folder for photo in plan.used)
@@ -256,6 +256,6 @@ def _advice(first: str, second: str, heights: tuple[float, float] | None) -> str
 
 
 def fallbacks(low: float, high: float) -> list[float]:
-    """Return heights from the lower to the higher end, with a constant ratio of neighbours."""
+    """Return heights from the lower to the higher end, each a constant factor above the last."""
     steps = min(_MOST_RUNGS, max(1, math.ceil(math.log(high / low) / math.log(_RUNG))))
     return [low * (high / low) ** (step / steps) for step in range(steps + 1)]

@@ -146,7 +146,8 @@ def _on_a_line(
     """Return a similarity for points [N, 3] on a line, and the points that agree with it.
 
     The roll about the line is arbitrary. Scale and direction are medians over all pairs of points
-    (Theil-Sen estimator), or over pairs of at most `_ASKED` points along the line.
+    (Theil-Sen estimator). If there are more than `_ASKED` points, only `_ASKED` points along the
+    line are paired.
     """
     import pycolmap
     from scipy.spatial.transform import Rotation

@@ -31,7 +31,7 @@ _BACK: Final = {5: 5, 6: 8, 7: 7, 8: 6}
 
 @dataclass(frozen=True)
 class Sorted:
-    """The image files below a folder, separated by their names.
+    """The image files below a folder, separated into photos and masks by their names.
 
     Attributes:
         photos: Names of the photos.
@@ -50,8 +50,9 @@ def sorted_out(root: Path, files: Sequence[str], wanted: Path | None) -> Sorted:
     Args:
         root: Folder of the photos.
         files: Names of the image files below it.
-        wanted: Folder of the masks. If None, masks are searched in the folder `masks`, in other
-            folders named `masks` whose files match photos next to them, and next to the photos.
+        wanted: Folder of the masks. If None, masks are searched in three places: in the folder
+            `masks`, in other folders named `masks` whose files match photos next to them, and next
+            to the photos.
 
     Raises:
         UserError: The folder is missing, or contains no mask for any photo.
@@ -83,8 +84,8 @@ def sorted_out(root: Path, files: Sequence[str], wanted: Path | None) -> Sorted:
 def _folders(root: Path, files: Sequence[str], wanted: Path | None) -> dict[str, list[str]]:
     """Return the mask folders among the photos, with the names of their files.
 
-    These are the requested folder, the top folder `masks`, and other folders with this name if
-    most of their files are named after photos next to them.
+    The mask folders are the requested folder, the folder `masks` at the top, and every other folder
+    `masks` in which most files are named after photos next to the folder.
     """
     asked = _asked(root, wanted)
 
@@ -132,14 +133,14 @@ def _of_photos(root: Path, folder: str, inside: Iterable[str], photos: Sequence[
 
 
 def _paired(root: Path, folder: str, photos: Sequence[str]) -> dict[str, Path]:
-    """Return photo -> mask for the masks in a folder below `root` and the photos next to it."""
+    """Return the mask of each photo, for masks in a folder below `root` and photos next to it."""
     below = {name: path for name in photos if (path := _below(folder, name)) is not None}
     pairs = pair_masks(root / folder, [*below.values()])
     return {name: pairs[path] for name, path in below.items() if path in pairs}
 
 
 def _usual(root: Path, photos: Sequence[str], folders: Iterable[str]) -> dict[str, Path]:
-    """Return the default masks: in `masks`, in other folders with this name, or next to photos."""
+    """Return the default masks: in `masks`, in other folders named `masks`, or next to photos."""
     stems = {name: str(PurePosixPath(name).with_suffix("")) for name in photos}
     beside = {name: [root / f"{stem}{end}.png" for end in _ENDS] for name, stem in stems.items()}
     masks = _first(root, beside)
@@ -234,7 +235,9 @@ def with_mask(photo: Photo, mask: Path) -> Photo:
 
 
 def counting_pixels(root: Path, photo: Photo) -> NDArray[np.uint8] | None:
-    """Return [H, W] with 255 for pixels that mask and transparency admit, or None for all.
+    """Return [H, W] with 255 for pixels that count by mask and transparency.
+
+    Return None if all pixels count.
 
     Raises:
         UserError: The photo or its mask is damaged, or the mask no longer fits.

@@ -31,7 +31,7 @@ _MAKE, _MODEL, _FOCAL, _FOCAL_35 = 0x010F, 0x0110, 0x920A, 0xA405
 
 
 def camera_of(image: "Image") -> str:
-    """Return make, model and focal length from EXIF, which are equal for photos of one zoom."""
+    """Return make, model and focal length from EXIF, which are equal for photos with one zoom."""
     header = image.getexif()
     details = header.get_ifd(_EXIF)
     parts = [header.get(_MAKE), header.get(_MODEL), _number(details.get(_FOCAL)),

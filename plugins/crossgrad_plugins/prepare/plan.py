@@ -1,4 +1,7 @@
-"""The plan: used photos and settings; a later call on the same scene must match them."""
+"""The plan of a scene: photos and settings.
+
+A later call on the same scene must have the same plan.
+"""
 
 import hashlib
 from collections.abc import Mapping

@@ -205,7 +205,10 @@ class _Way:
         return pycolmap.Rigid3d(pycolmap.Rotation3d(self.rotation), -self.rotation @ center)
 
     def crossing(self, other: "_Way") -> float | None:
-        """Return the distance at which another half-line crosses this one, or None if none does."""
+        """Return the distance at which another half-line crosses this half-line.
+
+        Return None if they do not cross.
+        """
         turned = (np.trace(self.rotation @ other.rotation.T) - 1.0) / 2.0
         along = float(self.direction @ other.direction)
         if turned < _SAME_ROTATION or abs(along) > _SAME_DIRECTION:
@@ -298,7 +301,9 @@ def off_lines(
     rays: tuple[NDArray[np.float32], NDArray[np.float32]],
     focals: tuple[float, float],
 ) -> NDArray[np.float64]:
-    """Return the distances [N] of matches from epipolar lines in pixels: the larger of two photos.
+    """Return the distances [N] of matches from epipolar lines, in pixels.
+
+    The larger of the distances in both photos is returned.
 
     Args:
         poses: Poses of two photos, world to camera.

@@ -44,7 +44,7 @@ _COUNT_OF_RECORDS: Final = struct.Struct("<Q")
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Silence pycolmap's messages inside the block."""
+    """Silence pycolmap's messages inside the `with` block."""
     guard_pycolmap()
     import pycolmap
 

@@ -198,7 +198,7 @@ def _draw(
 
 
 def _observe(screens: Sequence[Screen], centers: Tensor, gradient: Tensor) -> None:
-    """Store the gradients [K, 1, N, 2] by the projected means."""
+    """Store the gradients [K, 1, N, 2] with respect to the projected means."""
     absolute = getattr(centers, "absgrad", None)
     for view, screen in enumerate(screens):
         screen.mean_gradient = gradient[view, 0]

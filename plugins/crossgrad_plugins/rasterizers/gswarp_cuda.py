@@ -68,7 +68,7 @@ class GswarpRasterizer(Rasterizer):
 
     @hookimpl
     def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
-        """Return objections to a missing package and to other dilations."""
+        """Return objections if a package is missing or the selection is not supported."""
         if selection.device not in self.devices:
             return []
         reasons = []
@@ -181,6 +181,9 @@ def _draw(screen: Screen, settings: dict[str, Any], tensors: Sequence[Tensor]) -
 
 
 def _observe(screen: Screen, half: tuple[float, float], _centers: Tensor, gradient: Tensor) -> None:
-    """Store the gradient [N, 3] by the projected means, converted from NDC units to pixels."""
+    """Store the gradient [N, 3] with respect to the projected means.
+
+    It is converted from NDC units to pixels.
+    """
     along = zip(gradient[:, :2].unbind(1), half, strict=True)
     screen.mean_gradient = torch.stack([component / side for component, side in along], dim=1)

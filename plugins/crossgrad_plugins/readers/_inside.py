@@ -77,7 +77,9 @@ class Inside:
         return plain
 
     def found(self, text: str, where: object, base: str, files: FileNames) -> str:
-        """Return the same as `name`; if the file is missing, search `files` by the end of the path.
+        """Return the result of `name`.
+
+        If the file is missing, search `files` by the end of the path.
 
         Raises:
             UserError: There is no such file, and the name leads out of the scene.

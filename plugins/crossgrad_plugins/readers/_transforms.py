@@ -113,9 +113,9 @@ def transform_of(fields: Fields, key: str) -> NDArray[np.float64]:
 def read_lens(inside: Inside, frame: Fields, whole: Fields, photo: str) -> Calibration:
     """Return the lens of a frame. If the file gives no size, the photo's size is used.
 
-    A field of the frame takes precedence over the file's field with the same name. If the frame
-    gives a quantity in one way, the file's fields that give it in another way are ignored, because
-    they describe another lens.
+    A field of the frame takes precedence over the file's field with the same name. Different fields
+    can give the same quantity. If the frame gives a quantity by one field, the other fields of the
+    file for this quantity are ignored, because they describe another lens.
 
     Raises:
         UserError: A field is missing or wrong, or the lens cannot be undistorted.

@@ -204,7 +204,10 @@ def _world(
 
 
 def _transform(chunk: Element, file: Path, component: str) -> tuple[Frame3D, str | None]:
-    """Return the component's similarity, else the chunk's, and its source; None without any."""
+    """Return the similarity of the component, else of the chunk, and its source.
+
+    Return None if neither has a similarity.
+    """
     places = [(candidate, "component") for candidate in chunk.iterfind("components/component")
               if candidate.get("id", "") == component]  # fmt: skip
     for holder, name in (*places, (chunk, "chunk")):

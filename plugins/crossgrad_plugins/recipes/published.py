@@ -29,7 +29,7 @@ VALUES: Final[Mapping[str, Any]] = {
 
 
 class Published(Recipe):
-    """Order of a step, 3-sigma footprint, near plane, rates and schedule as published."""
+    """Order of a step, 3-sigma footprint, near plane, learning rates and schedule as published."""
 
     settings: ClassVar[Mapping[str, Any]] = {"plan": "off"}
     rasterizer_options: ClassVar[frozenset[str]] = frozenset({"footprint"})

@@ -1,7 +1,8 @@
 """Dropout of random Gaussians in training views, so that a run does not overfit few photos.
 
-Source: DropGaussian (Park et al. 2025), where the share of omitted Gaussians grows with the steps.
-The constant share and the choice of scenes were developed for crossgrad (docs/few-photos.md).
+Source: DropGaussian (Park et al. 2025), in which the share of omitted Gaussians grows with the
+steps. The constant share and the choice of scenes were developed for crossgrad
+(docs/few-photos.md).
 """
 
 from dataclasses import replace

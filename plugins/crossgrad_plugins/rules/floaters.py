@@ -1,8 +1,8 @@
 """Removal of floaters at the end of a run: primitives near a camera that no training photo shows.
 
-A step may move a Gaussian behind its camera or out of the photo at the side. Then no photo has a
-gradient for it, so it does not change any more. If the Gaussian is opaque, it hides the scene in
-photos from nearby (docs/floaters.md). The rule was developed for crossgrad.
+A step may move a Gaussian behind its camera or out of the photo at the side. Then no photo gives a
+gradient for the Gaussian, so the Gaussian does not change any more. If the Gaussian is opaque, it
+hides the scene in photos from nearby (docs/floaters.md). The rule was developed for crossgrad.
 """
 
 from typing import Final
@@ -81,8 +81,8 @@ def _primitives(model: Model) -> int:
 def floaters(model: Model, empty: float) -> Tensor:
     """Return [F] int64 rows of primitives in empty space that touch no training photo.
 
-    A primitive that is hidden by other primitives counts as touched. So a primitive is a floater
-    only if the rasterizer omits it from every training photo.
+    A primitive that is hidden by other primitives counts as touched. A primitive is therefore a
+    floater only if the rasterizer omits it from every training photo.
 
     Args:
         model: The model at the end of the run.

@@ -1,7 +1,7 @@
 """A decay of learning rates at the end of a run.
 
-The published rates of opacity, scale and colour are constant, so renders still fluctuate at the end
-of a run. Decaying rates remove these fluctuations (docs/steady-ends.md).
+The published learning rates of opacity, scale and colour are constant, so renders still fluctuate
+at the end of a run. A decay of the learning rates removes these fluctuations (docs/steady-ends.md).
 """
 
 from typing_extensions import override
@@ -26,7 +26,10 @@ class LrTail(Rule):
     def crossgrad_rate_factor(
         self, rate: LearningRate, step: int, schedule: Schedule
     ) -> float | None:
-        """Decay rates log-linearly from 1 to `factor`; return None for rates that decay already."""
+        """Decay learning rates log-linearly from 1 to `factor`.
+
+        Return None for learning rates that decay already.
+        """
         total = schedule.total
         step, start = min(step, total), (1.0 - self.share) * total
         if rate.decays or step <= start:

@@ -2,8 +2,8 @@
 
 A rasterizer projects a Gaussian as if the Gaussian were small compared with its distance. A large
 Gaussian beside or behind a camera therefore spreads over the camera's view, and a training photo
-may not show it (docs/floaters.md). If a camera has the Gaussian in its photo, training corrects the
-size without this rule. The rule was developed for crossgrad.
+may not show it (docs/floaters.md). If the camera's own photo shows the Gaussian, training corrects
+the size without this rule. The rule was developed for crossgrad.
 """
 
 from math import log
@@ -91,7 +91,9 @@ def _may_be_near(scene: Scene, positions: Tensor, distances: Tensor) -> Tensor:
 
 
 def _nearest_beside(scene: Scene, positions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return [N] distance to the nearest training camera with a position [N, 3] outside its photo.
+    """Return [N] the distance of each position [N, 3] to a camera.
+
+    The camera is the nearest training camera whose photo does not show the position.
 
     The distance is infinite for positions that all photos show.
     """

@@ -89,7 +89,11 @@ class Active(Sampler):
         losses: Mapping[str, float],
         rng: np.random.Generator,
     ) -> int:
-        """Return the second view: a never rendered one if there is any, else by loss difference."""
+        """Return the second view.
+
+        A view that was never rendered is preferred. Without such a view, the loss difference
+        decides.
+        """
         fresh = _never_rendered(others, losses)
         if fresh or str(first) not in losses:
             return _uniform(fresh or others, rng)

@@ -56,7 +56,7 @@ class Anchors30(Sampler):
 
 
 def _anchor_groups(context: SampleContext) -> Mapping[str, Sequence[int]]:
-    """Return label -> training views.
+    """Return the training views of each label.
 
     Raises:
         UserError: There is no grouping with labels near and far.

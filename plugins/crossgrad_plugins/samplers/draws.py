@@ -111,7 +111,7 @@ def training_views(context: SampleContext) -> range:
 
 
 def members_of(context: SampleContext) -> Mapping[str, tuple[int, ...]]:
-    """Return label -> positions of the label's training views; `near` is first, `far` is last."""
+    """Return the positions of the training views of each label; `near` is first, `far` is last."""
     return _members(context.groups or ())
 
 

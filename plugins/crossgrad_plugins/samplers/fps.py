@@ -18,7 +18,7 @@ class FarthestPoint(Sampler):
     space is the camera centre and the unit viewing direction times `direction_weight`; distances
     are Euclidean. The unit of the centre is the root mean square distance from the mean centre;
     both are computed without stray cameras. (If each step started a new order, the outermost
-    cameras would be rendered far more often than others.)
+    cameras would be rendered far more often than other cameras.)
 
     Source: farthest-point sampling, Eldar et al. 1997; the pose space was developed for crossgrad.
     """

@@ -42,7 +42,7 @@ _WORDS = "stopping: running runs save a checkpoint first (press again to skip th
 
 @contextmanager
 def noted(stop: Stop) -> Iterator[list[int]]:
-    """Count stop signals inside the block.
+    """Count stop signals inside the `with` block.
 
     Yields:
         The numbers of the received signals; the list grows while the block runs.
@@ -159,7 +159,8 @@ class Sweep:
         """Write a grid with the best parameters of each arm and scene, for other seeds.
 
         Raises:
-            UserError: The best parameters are not known yet, the file exists, or cannot be written.
+            UserError: The best parameters are not known yet, or the file exists or cannot be
+                written.
         """
         check_file(path)
         if path.exists():

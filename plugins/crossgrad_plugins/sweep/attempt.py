@@ -273,7 +273,7 @@ class Retries:
 
 
 def carried_out(job: Job, worker: Worker, name: str) -> Outcome:
-    """Carry out a run and wait for its end; an interrupt stops it with a checkpoint.
+    """Carry out a run and wait for its end; an interrupt stops the run with a checkpoint.
 
     If the machine was lost and the task is repeated, the run continues from its files.
 

@@ -108,7 +108,8 @@ def _below(values: Mapping[str, Any], overriding: Mapping[str, Any]) -> dict[str
     """Merge values with the settings that override them, in one layer.
 
     If a setting chooses another component, the options of the replaced component are dropped. A run
-    has one length, so if a setting sets the length, a length among the values is dropped, too.
+    has only one length. If a setting sets the length, a length among the values is therefore
+    dropped.
     """
     lengths = LENGTHS if LENGTHS & overriding.keys() else frozenset()
     components = {name.removesuffix(".name") for name in overriding if name.endswith(".name")}
@@ -135,9 +136,10 @@ def _ends(grid: Grid, cells: Iterable[Job], standings: Iterable[Standing]) -> En
 def _best(
     arm_choices: Sequence[Choice], scene: str, ends: Ends, grid: Grid
 ) -> tuple[Choice, list[str]]:
-    """Return the best of an arm's choices on a scene, and notes on excluded choices.
+    """Return the best configuration of an arm on a scene, and notes on excluded configurations.
 
-    All choices are compared on the same seeds, so a choice with a failed run is excluded.
+    All configurations are compared on the same seeds, so a configuration with a failed run is
+    excluded.
     """
     results = [(choice, ends[choice.label, scene]) for choice in arm_choices]
     _check_ended(results, scene, grid)

@@ -98,7 +98,7 @@ class Metric(_Part):
     """The metric of the final table.
 
     Attributes:
-        name: A figure of the held-out views, as in summary.json.
+        name: A metric of the held-out views, as in summary.json.
         goal: `maximize` or `minimize`; the default is `maximize`, but `minimize` for LPIPS.
     """
 
@@ -193,7 +193,7 @@ class Choice(_Part):
     def settings(
         self, base: Settings, scene: str | None, assignments: Sequence[str] = ()
     ) -> Settings:
-        """Return the settings of the choice's runs on a scene, without the seed.
+        """Return the settings of this configuration's runs on a scene, without the seed.
 
         Args:
             base: The settings of all runs of the grid.
@@ -228,7 +228,7 @@ def choices(grid: Grid) -> list[Choice]:
 
 
 def _axes(grid: Grid, arm: Arm) -> dict[str, tuple[Any, ...]]:
-    """Return setting -> values, for the settings that vary in an arm."""
+    """Return the values of the settings that vary in an arm, by setting."""
     parameters = {**grid.parameters, **arm.parameters}
     return dict(axis for name, parameter in parameters.items() for axis in parameter.axes(name))
 

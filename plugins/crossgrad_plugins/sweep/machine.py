@@ -80,7 +80,7 @@ def idle_first(cores: Sequence[int]) -> tuple[int, ...]:
 
 
 def _counts() -> dict[int, list[int]]:
-    """Return core number -> its ticks in each state so far."""
+    """Return the ticks of each core in each state so far, by core number."""
     rows = (line.split() for line in _COUNTS.read_text(encoding="ascii").splitlines())
     named = ((row[0].removeprefix("cpu"), row[1:]) for row in rows if row)
     return {int(name): list(map(int, counts)) for name, counts in named if name.isdecimal()}

@@ -98,14 +98,14 @@ def _standing(job: Job, folder: Path, last: Record | None, *, alive: bool) -> St
 
 
 def figures(standing: Standing) -> dict[str, float]:
-    """Return name -> finite figure of all held-out views of a finished run."""
+    """Return the finite metrics of all held-out views of a finished run, by name."""
     overall = (standing.summary or {}).get("overall") or {}
     numbers = ((n, v) for n, v in overall.items() if isinstance(v, int | float))
     return {name: float(value) for name, value in numbers if isfinite(value)}
 
 
 def figure(standing: Standing, name: str) -> float | None:
-    """Return a figure of all held-out views of a finished run; None if missing or not finite."""
+    """Return a metric of all held-out views of a finished run; None if missing or not finite."""
     return figures(standing).get(name)
 
 
@@ -115,7 +115,10 @@ def begun(folder: Path) -> bool:
 
 
 def newest_row(folder: Path) -> dict[str, str]:
-    """Return the newest evaluation of a run, column -> text; empty before the first evaluation."""
+    """Return the newest evaluation of a run, with a text for each column.
+
+    The result is empty before the first evaluation.
+    """
     path = folder / "metrics.csv"
     if not path.is_file():
         return {}

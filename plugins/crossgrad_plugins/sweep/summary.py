@@ -29,10 +29,10 @@ def listing(cells: Iterable[Job], standings: Iterable[Standing]) -> Iterator[str
 
 
 def table(cells: Sequence[Job], standings: Iterable[Standing], metric: Metric) -> Iterator[str]:
-    """Yield a table of a figure, configurations x scenes: mean and standard deviation over seeds.
+    """Yield a table of a metric, configurations x scenes: mean and standard deviation over seeds.
 
-    An asterisk marks the best mean of each scene. If no finished run has the figure, a line lists
-    the figures that the runs have.
+    An asterisk marks the best mean of each scene. If no finished run has the metric, a line lists
+    the metrics that the runs have.
     """
     all_standings = tuple(standings)
     values = {standing.job.id: figure(standing, metric.name) for standing in all_standings}
@@ -77,7 +77,7 @@ def _cell(values: Sequence[float] | None, best: float | None) -> str:
 def write_plan(layout: Layout, cells: Iterable[Job]) -> None:
     """Write runs.csv, the table of runs; rows of earlier grids in the folder follow at the end.
 
-    A run that is in both grids gets its name in the new grid.
+    A run that is in both grids keeps the name that it has in the new grid.
     """
     rows = [(job.id, job.scene, job.label, str(job.seed)) for job in cells]
     ids = {run for run, *_ in rows}

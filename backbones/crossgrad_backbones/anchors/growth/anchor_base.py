@@ -111,7 +111,7 @@ class NewAnchors:
         return int(self.positions.shape[0])
 
     def limited(self, room: int) -> tuple["NewAnchors", int]:
-        """Return the `room` strongest anchors, in unchanged order, and the number of others."""
+        """Return the `room` strongest anchors in unchanged order, and the count of dropped ones."""
         left_out = max(0, len(self) - room)
         if left_out == 0:
             return self, 0
@@ -119,7 +119,7 @@ class NewAnchors:
         return self.at(ranked[:room].sort().values), left_out
 
     def and_more(self, more: "NewAnchors") -> "NewAnchors":
-        """Append other anchors that have the same further tensors."""
+        """Append anchors that have the same set of further tensors."""
         return NewAnchors(
             torch.cat([self.positions, more.positions]),
             torch.cat([self.cells, more.cells]),
@@ -149,7 +149,7 @@ class AnchorDensifier(Densifier):
 
     A subclass decides which anchors are added; everything else follows Scaffold-GS. Counters of an
     offset or an anchor are cleared after a decision about it. A rarely seen anchor therefore keeps
-    its counters until it has been seen often enough.
+    its counters until it has been seen often enough for a decision.
     """
 
     tensors: ClassVar[frozenset[str]] = frozenset({"anchors", "offsets", "features", "scales"})

@@ -50,7 +50,7 @@ def exact_case(batch: Batch, place: int) -> ExactCase:
 
 
 def _from_laws(subject: Subject, batch: Batch, outputs: Floats) -> list[float] | list[None]:
-    """Return [B] errors of scaling with the gradients, and of the order of two views.
+    """Return errors [B] for two laws: scaling with the gradients, and the order of two views.
 
     The result is None for operators that have a reference.
     """

@@ -1,4 +1,4 @@
-"""Batches of short gradients, of kinds for which small solvers often fail."""
+"""Batches of short gradients of the kinds for which small solvers often fail."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -30,7 +30,10 @@ BLOCK = Block("means", ("means",), True, "geometry", LearningRate(1.0))
 
 
 def cases_of(views: int) -> int:
-    """Return the number of cases of a batch: fewer for more views, which take longer."""
+    """Return the number of cases of a batch.
+
+    Cases with more views take longer, so a batch contains fewer of these cases.
+    """
     return max(1, _CASES // views**2)
 
 
@@ -172,7 +175,7 @@ def search_views(count: int, seed: int = 0) -> Views:
 
 
 def results(operator: Operator, batch: Batch, views: Views | None = None) -> Rows:
-    """Return the results [B, P] of an operator for each case, NaN for cases that raise."""
+    """Return the results [B, P] of an operator for each case, NaN for cases that raise an error."""
     if isinstance(operator, GramianOperator):
         operator = operator.model_copy(update={"granularity": "gaussian"})
     return _results(operator, batch.rows, batch.dtype, views or search_views(batch.views))
@@ -196,7 +199,10 @@ def _results(operator: Operator, rows: Rows, dtype: torch.dtype, views: Views) -
 
 
 def _halved(operator: Operator, rows: Rows, dtype: torch.dtype, views: Views) -> Rows:
-    """Split the batch to find the cases that raise, so that other cases keep their results."""
+    """Split the batch to find the cases that raise an error.
+
+    The results of the remaining cases are kept.
+    """
     if len(rows) == 1:
         return np.full(rows[:, 0].shape, np.nan)
     half = len(rows) // 2

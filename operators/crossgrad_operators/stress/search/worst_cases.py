@@ -23,7 +23,7 @@ KEPT = 5
 
 @dataclass
 class WorstCases:
-    """Counts and worst cases, updated with every batch.
+    """Counts and worst cases of one operator, updated with every batch.
 
     Attributes:
         operator: Name of the operator.
@@ -108,7 +108,10 @@ class WorstCases:
 
 
 def severity(finding: Finding, *, inside: bool) -> float:
-    """Return the error inside the set, or |u| / longest gradient outside, or 0 without either."""
+    """Return the error inside the set, or |u| / longest gradient outside.
+
+    Return 0 if neither is known.
+    """
     if not inside:
         return finding.ratio if finding.is_outside else 0.0
     excused = finding.is_outside or finding.verdict == "undetermined"

@@ -164,9 +164,9 @@ def meetings(
 ) -> Iterator[Row]:
     """Yield few admitted rows in which one value meets every value of the other factors.
 
-    First, the values of all factors are combined in turn. Values that do not occur in an admitted
-    row are then tried with the default values of the other factors, of which one at a time is
-    changed. Not every row is tried, because many factors have too many rows.
+    First, the values of all factors are combined in turn. A value without an admitted row so far is
+    then tried with the default values of the other factors; one factor at a time is changed. Not
+    every row is tried, because many factors have too many rows.
 
     Args:
         place: Factor of the value.

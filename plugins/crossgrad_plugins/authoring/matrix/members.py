@@ -41,8 +41,8 @@ def members_of(package: str) -> Members:
     """Find the components of a package, and all other installed components.
 
     Raises:
-        UserError: There is no such package, none of its components takes part in training, or one
-            of them cannot be combined, for example because it cannot be loaded.
+        UserError: There is no such package, no component of the package takes part in training, or
+            a component cannot be combined, for example because it cannot be loaded.
     """
     plugins = entries_of(package)
     slots = {slot: plural(slot) for slot in (*SLOTS, *FURTHER)}
@@ -102,10 +102,10 @@ def combinations_of(members: Members, admits: Admits, *, full: bool) -> Iterator
 
     Args:
         members: The components that are combined.
-        admits: Called with every requested combination; returns True if it can work.
+        admits: Called with every requested combination; returns True if the combination can work.
         full: True for all combinations with a component of the package. False for the fewest
-            combinations in which each of them occurs with every component of the other slots that
-            it can work with.
+            combinations in which every component of the package occurs with every component of
+            other slots that it can work with.
     """
     ours = sorted((SLOTS.index(slot), name) for slot, name in members.own if slot in SLOTS)
     if ours:
@@ -128,7 +128,10 @@ def _all_of(members: Members, ours: set[tuple[int, str]]) -> Iterator[Row]:
 def _few_of(
     members: Members, slots: tuple[str, ...], ours: list[tuple[int, str]], admits: Admits
 ) -> Iterator[Row]:
-    """Yield combinations in which each component of the package meets all that it works with."""
+    """Yield few combinations.
+
+    Each component of the package occurs with every component that it works with.
+    """
     values = [members.names[slot] for slot in slots[: len(SLOTS)]]
     values += [(name,) for _, name in ours[: len(slots) - len(SLOTS)]]
 

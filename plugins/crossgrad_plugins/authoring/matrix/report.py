@@ -83,7 +83,7 @@ def train_matrix(package: str, *, full: bool) -> tuple[str, bool]:
         full: True for all combinations instead of a pairwise design.
 
     Returns:
-        The report in 80 columns, and whether everything was trained or refused without failure.
+        The report in 80 columns, and whether no combination failed.
 
     Raises:
         UserError: For the reasons of `members_of`.

@@ -137,7 +137,7 @@ def draw_regimes(c: Comparison) -> Drawn:
 
 
 def draw_profile(c: Comparison) -> Drawn | None:
-    """Draw a panel for each cost; return None for a single arm or without a problem of all arms."""
+    """Draw a panel for each cost; return None for a single arm or if arms share no problem."""
     by_cost = {cost: ratios([row for row in c.reached if row.cost == cost]) for cost in c.costs}
     shown = {cost.title: by for cost, by in by_cost.items() if any(by.values())}
     if len(c.arms) < 2 or not shown:  # noqa: PLR2004 - nothing to compare

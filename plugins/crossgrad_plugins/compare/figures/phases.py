@@ -24,7 +24,7 @@ _HATCHES = ("", "", "", "", "", "", "", "///", "...", "xxx")
 
 
 def phases_of(comparison: Comparison) -> dict[str, dict[str, float]]:
-    """Return arm -> phase -> milliseconds per step, averaged over the runs that recorded phases.
+    """Return milliseconds per step by arm and phase, averaged over the runs that recorded phases.
 
     Phases are wall-clock seconds. The result is empty if wall-clock seconds are not comparable or
     not requested.

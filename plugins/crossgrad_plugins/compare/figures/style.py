@@ -96,7 +96,10 @@ class Look:
 
 
 def looks(arms: Sequence[str]) -> dict[str, Look]:
-    """Return arm -> look; arms also differ in marker and line style, for print without colours."""
+    """Return the look of each arm.
+
+    Arms also differ in marker and line style, for print without colours.
+    """
     return {
         arm: Look(
             COLORS[index % len(COLORS)],
@@ -110,7 +113,7 @@ def looks(arms: Sequence[str]) -> dict[str, Look]:
 
 @contextmanager
 def styled() -> Iterator[None]:
-    """Apply the style to figures inside the block; ignore warnings about missing glyphs."""
+    """Apply the style to figures inside the `with` block; ignore warnings about missing glyphs."""
     from matplotlib import rc_context
 
     with rc_context(_RC), warnings.catch_warnings():
@@ -172,7 +175,7 @@ def _for_page(svg: str, name: str) -> str:
 
 
 def variables() -> dict[str, str]:
-    """Return name of a style sheet variable of the page -> its colour in figures."""
+    """Return the colour in figures of each style sheet variable of the page."""
     series = {f"series-{number}": color for number, color in enumerate(COLORS)}
     return {"ink": INK, "faint": FAINT, "grid": GRID, **series}
 
@@ -235,7 +238,7 @@ def legend_above(
 
 
 def wrapped(text: str, room: int) -> str:
-    """Break a text into lines of at most `room` letters, as far as its parts are short enough."""
+    """Break a text into lines of at most `room` letters, if its parts are short enough."""
     lines = [""]
     for part in _PARTS.findall(text):
         if lines[-1] and len(lines[-1] + part) > room:

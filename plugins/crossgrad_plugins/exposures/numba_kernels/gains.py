@@ -3,7 +3,8 @@
 sRGB's curve has a straight part for dark values, and a power part above it. If a value is in the
 power part before and after the gain G, decoding, multiplying and encoding are one linear map of x:
 with o = 0.055, G^(1/2.4) (x + o) - o. If x is in the straight part before and after, the map is G
-x. Only values that change parts need a power; they are found in blocks of eight values.
+x. Only values that move from one part to the other need a power function; they are found in blocks
+of eight values.
 """
 
 from typing import TypeAlias
@@ -63,7 +64,7 @@ def _exposed(value: np.float32, gain: np.float32) -> np.float32:
 
 @device
 def _slope(value: np.float32, taken: np.float32, gain: np.float32) -> np.float32:
-    """Return the derivative of one value after the gain by the value itself, without a power."""
+    """Return the derivative of a value after the gain with respect to the value before it."""
     if taken <= _THRESHOLD:
         if value <= _THRESHOLD:
             return gain
@@ -75,7 +76,11 @@ def _slope(value: np.float32, taken: np.float32, gain: np.float32) -> np.float32
 
 @device
 def _sides(values: Lanes, straight: Lanes, bright: Lanes) -> tuple[np.uint64, np.uint64]:
-    """Return bits of the values in the straight part before and after, and in the power part."""
+    """Return two sets of bits.
+
+    They mark the values that stay in the straight part of the curve, and the values that stay in
+    the power part.
+    """
     dark = splat(_THRESHOLD)
     both = bits(values <= dark) & bits(straight <= dark)
     return both, _ALL & ~bits(values <= dark) & ~bits(bright <= dark)
@@ -157,7 +162,7 @@ def expose_back(
 
 @device
 def _by_stops(taken: np.float32) -> float:
-    """Return the derivative of one value after the gain by the stops."""
+    """Return the derivative of one value after the gain with respect to the stops."""
     if taken <= _THRESHOLD:
         return _OF_LINE * taken
     return _OF_POWER * (taken + _OFFSET)

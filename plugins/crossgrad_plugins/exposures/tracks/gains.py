@@ -256,7 +256,10 @@ def _neighbours(o: Observations, photos: int) -> float:
 
 
 def _direct(o: Observations, weights: _Floats, parts: NDArray[np.int64]) -> _Floats:
-    """Return the gains of least weighted squares, by a direct solver; first photo of a part: 0."""
+    """Return the gains of least weighted squares, by a direct solver.
+
+    The first photo of each part has the gain 0.
+    """
     from scipy.sparse.linalg import spsolve
 
     gains, count = np.zeros(len(parts)), len(parts)

@@ -1,4 +1,4 @@
-"""The brightness of photos where they show SfM points."""
+"""The brightness of photos at the SfM points that they show."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -65,7 +65,11 @@ def observations_of(scene: Scene, views: Sequence[View]) -> Observations:
 
 
 def _shared_points(scene: Scene, views: Sequence[View]) -> NDArray[np.bool_]:
-    """Return which points [P] are used: points seen by two views; only a part of very many."""
+    """Return which points [P] are used.
+
+    Usable points are seen by at least two views. If there are very many such points, only a part is
+    used.
+    """
     times = np.zeros(len(scene.points), dtype=np.int64)
     for view in views:
         times[view.seen] += 1

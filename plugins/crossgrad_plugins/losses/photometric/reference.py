@@ -4,7 +4,8 @@ This is the readable definition, and the reference for tests of the fused kernel
 
 Autograd launches more kernels, and most of them run for less time than their launch takes. The
 explicit gradient uses sums and differences, as the fused CPU kernel does (`numba_kernels.fused`).
-The function filters twelve planes forward and nine backward, instead of fifteen each.
+The explicit gradient filters twelve planes forward and nine backward, while autograd filters
+fifteen each.
 """
 
 from functools import cache
@@ -125,7 +126,7 @@ def blurred(fields: Tensor) -> Tensor:
 def loss_and_gradient(
     image: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the value of `l1_ssim_loss`, a scalar, and its gradient by the image [H, W, C].
+    """Return the value of `l1_ssim_loss`, and its gradient with respect to the image [H, W, C].
 
     Args:
         image: [H, W, C] floating point.

@@ -26,7 +26,8 @@ def package_missing(package: str, *others: str) -> str | None:
 def compiler_missing(package: str) -> str | None:
     """Return why a package cannot compile its kernels at first use.
 
-    The result is None if it can compile them or if they are compiled already.
+    The result is None if the package can compile its kernels, or if the kernels are compiled
+    already.
     """
     if is_compiled(package):
         return None

@@ -17,7 +17,8 @@ class Drawing:
 
     Attributes:
         outputs: Differentiable results.
-        centers: The tensor whose gradient is the gradient of the loss by the projected means.
+        centers: The tensor whose gradient is the gradient of the loss with respect to the projected
+            means.
     """
 
     outputs: tuple[Tensor, ...]

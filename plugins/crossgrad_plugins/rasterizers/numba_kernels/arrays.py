@@ -40,7 +40,7 @@ class GaussianArrays:
         degree: Active degree, 0 to 3.
         sparse_rows: Fields whose rows `bring` must update before they are read, and whose gradients
             contain only these rows.
-        bring: Function of [R] int32 rows that updates them.
+        bring: Function that updates the given rows [R] int32.
     """
 
     means: Float32
@@ -99,7 +99,9 @@ class DrawOptions:
 
 @dataclass(frozen=True)
 class Projected:
-    """The drawn Gaussians, as records that fill each chunk of Gaussians from its start.
+    """The drawn Gaussians as records.
+
+    The records of a chunk of Gaussians begin at the start of the chunk.
 
     Attributes:
         camera: The view.
@@ -174,13 +176,13 @@ class GaussianGradients:
         quats: [N, 4].
         scales: [N, 3].
         opacities: [N].
-        colors: [N, 3] by the rendered RGB (after the harmonics are clamped).
+        colors: [N, 3] with respect to the rendered RGB (after the harmonics are clamped).
         dc: [N, 1, 3], or [R, 1, 3] for the drawn rows; None without harmonics.
         rest: [N, B - 1, 3], or [R, B - 1, 3] for the drawn rows; None without harmonics or if not
             requested.
-        centres: [N, 2] by the projected mean, per pixel.
-        absolute: [N, 2] by the projected mean, summed as absolute values over pixels; None unless
-            requested.
+        centres: [N, 2] with respect to the projected mean, per pixel.
+        absolute: [N, 2] with respect to the projected mean, summed as absolute values over pixels;
+            None unless requested.
         directions: [N, 6, 5] of `crossgrad_core.contract.gaussians.Screen`; None unless requested.
     """
 

@@ -101,7 +101,7 @@ def basis_of(degree: int, ways: NDArray[np.float64], table: NDArray[np.float32])
 
 @device
 def pull_ways(degree: int, v: NDArray[np.float32], ways: NDArray[np.float64]) -> None:
-    """Replace sixteen unit vectors by the gradients of sum(v * basis) by the original vectors.
+    """Replace sixteen unit vectors by the gradients of sum(v * basis) with respect to the vectors.
 
     Args:
         degree: Active degree.

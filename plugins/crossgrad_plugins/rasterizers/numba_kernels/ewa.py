@@ -235,8 +235,9 @@ def axes_gradient(
 ) -> Triple:
     """Return the gradients of A, B (as one number) and C of the analytic response.
 
-    The sums are sums over the gradients by the logarithms of the standard deviations. A standard
-    deviation at its lower bound has no gradient, and the axes of a round Gaussian do not rotate.
+    The sums are sums over the gradients with respect to the logarithms of the standard deviations.
+    A standard deviation at its lower bound has no gradient, and the axes of a round Gaussian do not
+    rotate.
     """
     floor = SIGMA_FLOOR * SIGMA_FLOOR
     v_1 = 0.5 * sum_sigma_1 / variance_1 if variance_1 > floor else 0.0

@@ -1,4 +1,4 @@
-"""From the sums per entry to the gradients of the Gaussians' parameters."""
+"""Conversion of the sums per entry to gradients of the Gaussians' parameters."""
 
 import math
 
@@ -301,7 +301,7 @@ def project_backward(
         v_quats: [N, 4].
         v_scales: [N, 3].
         v_opacities: [N].
-        v_colors: [N, 3], by the rendered RGB; written for drawn Gaussians only.
+        v_colors: [N, 3], with respect to the rendered RGB; written for drawn Gaussians only.
         v_centres: [N, 2], of the projected mean, per pixel.
         v_absolute: [N, 2], sums of absolute values; [0, 2] if not computed.
     """

@@ -175,9 +175,10 @@ def place_record(
 def square(k: int, width: int, height: int, found: NDArray[np.float64]) -> tuple[int, Rectangle]:
     """Return the published radius of projected Gaussian k and the pixels that it may touch.
 
-    These pixels are the pixels of all 16 x 16 tiles that overlap a square around the mean; half the
-    side of the square is the published radius. The radius is 0 if the square is outside the image
-    (3DGS: three standard deviations; the squared half difference of the variances is at least 0.1).
+    The function returns the pixels of all 16 x 16 tiles that overlap a square around the mean. Half
+    the side of the square is the published radius. The radius is three standard deviations, as in
+    3DGS, or 0 if the square is outside the image. The squared half difference of the variances is
+    at least 0.1.
     """
     u, v = get(found, MEAN_U, k), get(found, MEAN_V, k)
     a, b, c = get(found, VARIANCE_X, k), get(found, COVARIANCE, k), get(found, VARIANCE_Y, k)
@@ -344,7 +345,7 @@ def analytic_shape(
     within: Rectangle,
     found: NDArray[np.float64],
 ) -> tuple[int, Rectangle, Analytic]:
-    """Return the same as `plain_shape`, for the analytic response."""
+    """Return the values that `plain_shape` returns, for the analytic response."""
     nothing = 0, (1.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     u, v = get(found, MEAN_U, k), get(found, MEAN_V, k)
     a, c, det = get(found, VARIANCE_X, k), get(found, VARIANCE_Y, k), get(found, DETERMINANT, k)

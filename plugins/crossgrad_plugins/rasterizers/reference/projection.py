@@ -50,7 +50,7 @@ def project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> Pro
     """Project Gaussians by the local affine approximation (EWA, Zwicker et al. 2001).
 
     No Gaussian is culled. The row of a Gaussian that is behind the camera or has a zero quaternion
-    is not finite or has no meaning; the caller omits such rows.
+    has no meaning and may be non-finite. The caller omits such rows.
 
     Args:
         means: [N, 3] local units.

@@ -58,7 +58,7 @@ class Recorder:
 
 
 def recorded(table: Tensor, recorder: Recorder) -> tuple[Tensor, Tensor]:
-    """Return the same table [V, C], recorded by the backward pass, and a probe [V, R].
+    """Return the unchanged table [V, C], recorded by the backward pass, and a probe [V, R].
 
     The first two columns are projected means. The probe is passed to the pixels like the means, but
     does not change the image. The gradient of the probe contains sums over pixels (see `offsets`).
@@ -72,9 +72,9 @@ def offsets(
 ) -> tuple[Tensor, Tensor]:
     """Return the mean minus the pixel centre for every pixel and Gaussian: dx [P, G] and dy [P, G].
 
-    The backward pass sums the pixels' gradients for the means. For the probe's first two columns it
-    sums their absolute values. For the columns after the axes, if there are such columns, it sums
-    the result of `binned_directions`.
+    The backward pass sums the pixels' gradients for the means. For the probe's first two columns
+    the backward pass sums their absolute values. For the columns after the axes, if there are such
+    columns, the backward pass sums the result of `binned_directions`.
 
     Args:
         means: [G, 2] pixels.
@@ -146,7 +146,8 @@ def binned_directions(
     """Return [G, BINS, FIELDS] of `Screen.directions`, summed over some pixels.
 
     Args:
-        gradients: [2, P, G] gradient of each pixel by the projected mean of each Gaussian.
+        gradients: [2, P, G] gradient of each pixel with respect to the projected mean of each
+            Gaussian.
         offsets: [2, P, G] pixel centre minus mean, pixels.
         axes: [G, 2] from `longest_axes`.
         size: Width and height of the image, pixels.

@@ -7,9 +7,9 @@ between the two images:
     SSIM = (M_s^2 - M_d^2 + 2 C1) (V_s - V_d + 2 C2) / ((M_s^2 + M_d^2 + 2 C1) (V_s + V_d + 2 C2)),
 
 with V = E[.^2] - M^2. The gradient is G * a + s (G * b) + d (G * c). G * is a convolution with the
-same window; a, b, c are the derivatives by M_s + M_d, V_s and V_d. In smooth parts of an image,
-variances are differences of nearly equal numbers. Therefore s and d are taken relative to a centre,
-their mean over the tile (per channel).
+same window; a, b, c are the derivatives with respect to M_s + M_d, V_s and V_d. In smooth parts of
+an image, variances are differences of nearly equal numbers. Therefore s and d are taken relative to
+a centre, their mean over the tile (per channel).
 
 The image is divided into tiles whose size depends only on the image's size. A tile is processed row
 by row with ring buffers of sixteen rows (s, d, mask; a, b, c). The working set therefore stays in

@@ -9,7 +9,7 @@ sigma1 sigma2 W(u, sigma1) W(v, sigma2) of the opacity. The window W of one pixe
 Let t = |u| / sigma and h = 1 / (2 sigma), let c be the cubic, and let D = c(t + h) - c(t - h) in
 closed form. Then W = (1 - exp(-D)) / ((1 + U) (1 + L)) with U = exp(c(t - h)) and L = exp(-c(t +
 h)), so that exp(-D) = U L. For small D, a series replaces 1 - exp(-D), so that wide Gaussians do
-not lose precision by cancellation. The derivatives use the same terms.
+not lose precision by cancellation. The derivatives of W are computed from the same terms.
 """
 
 import math
@@ -79,11 +79,11 @@ ROW_V = TILE_HEIGHT
 
 @device
 def main_axes(a: float, b: float, c: float, det: float) -> tuple[float, float, float, float]:
-    """Return cosine and sine of the longer axis, and the variances along both axes, px^2.
+    """Return cosine and sine of the longer axis' angle, and the variances along both axes, px^2.
 
-    A round Gaussian has no main axes; the axes of the image are used. The angle is in (-90, 90]
-    degrees. The angle is halved without trigonometric functions, so that loops over this function
-    are vectorised.
+    A round Gaussian has no main axes, so the function returns the axes of the image. The angle is
+    in (-90, 90] degrees. The angle is halved without trigonometric functions, so that loops over
+    this function are vectorised.
 
     Args:
         a: Entry of the undilated covariance [[a, b], [b, c]], px^2.
@@ -255,7 +255,7 @@ def _log_window_gradients(
     share: Lanes,
     inverse_both: Lanes,
 ) -> tuple[Lanes, Lanes]:
-    """Return sigma times the derivatives of log(sigma W) by the offset and by sigma.
+    """Return sigma times the derivatives of log(sigma W) with respect to the offset and to sigma.
 
     `inverse_both` is 1 / ((1 + U) (1 + L)); the other arguments are as in `_window_terms`.
     """
@@ -286,8 +286,8 @@ def coverage_gradients(
 ) -> tuple[Lanes, Lanes, Lanes, Lanes, Lanes]:
     """Return alpha as `coverages` does, and the derivatives of its logarithm.
 
-    The derivatives are by u, v, sigma1 and sigma2, each times its sigma. The derivatives are
-    undefined for tiny alpha.
+    The derivatives are with respect to u, v, sigma1 and sigma2, each times its sigma. The
+    derivatives are undefined for tiny alpha.
     """
     upper_1, lower_1, share_1, both_1 = _window_terms(u, inverse_1, constants)
     upper_2, lower_2, share_2, both_2 = _window_terms(v, inverse_2, constants)

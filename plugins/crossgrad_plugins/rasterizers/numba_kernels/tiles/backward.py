@@ -1,7 +1,7 @@
 """Gradients of the tiles' pixels, summed per entry (a Gaussian in a tile), front to back.
 
 Let S be the contribution of all Gaussians behind the current Gaussian to the linearised loss. The
-start value of S is the gradient of the pixel times the pixel. c is the gradient times the
+start value of S is the pixel's gradient times the pixel's value. c is the gradient times the
 Gaussian's colour. Then
 
     dL/d(alpha) = T c - S / (1 - alpha),
@@ -159,10 +159,12 @@ def _blend(
     capped: NDArray[np.float32] | None,
     responses: NDArray[np.float32],
 ) -> tuple[Lanes, Lanes, Lanes, Lanes]:
-    """Blend a plain Gaussian into patches; replace alpha by the gradient by the exponent.
+    """Blend a plain Gaussian into patches.
+
+    Replace alpha by the gradient with respect to the exponent.
 
     Returns:
-        The sums of the gradients by red, green, blue and the depth.
+        The sums of the gradients with respect to red, green, blue and the depth.
     """
     red = broadcast_wide(records, record + RED)
     green = broadcast_wide(records, record + GREEN)
@@ -470,9 +472,9 @@ def differentiate(
         image: [H, W, 3] as rendered, with the background.
         alpha: [H, W] as rendered.
         depth: [H, W] as rendered, or None.
-        v_image: [H, W, 3] gradient of the loss by the image.
-        v_alpha: [H, W] gradient by alpha, or None.
-        v_depth: [H, W] gradient by the depth, or None.
+        v_image: [H, W, 3] gradient of the loss with respect to the image.
+        v_alpha: [H, W] gradient with respect to alpha, or None.
+        v_depth: [H, W] gradient with respect to the depth, or None.
         absolute: Any vector selects the sums of absolute gradients; None omits them.
         analytic: Any vector selects records of the analytic response; None selects the plain
             response.

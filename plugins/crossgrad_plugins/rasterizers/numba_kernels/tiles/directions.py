@@ -1,4 +1,4 @@
-"""Gradients of single pixels by a Gaussian's projected mean, and their directions.
+"""Gradients of single pixels with respect to a Gaussian's mean, and their directions.
 
 This is a separate pass after the backward pass, for densifiers that need directions. The pass
 renders the tiles again and sums, per entry and bin, the fields of
@@ -133,8 +133,8 @@ def _spread(
     """Add the gradients of two columns of four pixels to the sums of their bins.
 
     Args:
-        gx: Gradients by the x of the projected mean, px^-1.
-        gy: Gradients by the y of the projected mean, px^-1.
+        gx: Gradients with respect to the x of the projected mean, px^-1.
+        gy: Gradients with respect to the y of the projected mean, px^-1.
         along: Positions along the axis, in standard deviations.
         width: Width of the image, pixels. Directions are in NDC units.
         height: Height of the image, pixels.
@@ -201,7 +201,9 @@ def mean_gradients(
     v_depth: NDArray[np.float32] | None,
     analytic: NDArray[np.float32] | None,
 ) -> tuple[Lanes, Lanes]:
-    """Blend a Gaussian into a patch; return the pixels' gradients by the projected mean (x and y).
+    """Blend a Gaussian into a patch; return the gradients of the pixels.
+
+    Each gradient is with respect to x and y of the projected mean.
 
     Gradients of plain records are in units of 2 log 2 px^-1; gradients of analytic records are in
     px^-1.

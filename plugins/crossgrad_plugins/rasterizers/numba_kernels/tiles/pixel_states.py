@@ -239,8 +239,9 @@ def blend(
         at: First element of the patch's state.
         constants: From `vector_constants`.
 
-    Returns: The weights of the Gaussian in the pixels, and alpha times the gradient of the loss by
-    alpha, which is the gradient by the exponent and by the logarithm of the opacity.
+    Returns: The weights of the Gaussian in the pixels, and alpha times the gradient of the loss
+    with respect to alpha. The second result is also the gradient with respect to the exponent and
+    with respect to the logarithm of the opacity.
     """
     zero = splat_wide(np.float32(0.0))
     before = load_wide(state, at + PASSED)
