@@ -148,10 +148,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Args:
         arguments: The words after `crossgrad`; `sys.argv[1:]` by default.
     """
-    if arguments is None:  # If this function runs, the process belongs to the command.
+    # The command line calls this function without arguments. In this case, the process belongs to
+    # the command.
+    if arguments is None:
         outlast_readers()
     try:
-        # Not `app()`, which would replace `sys.excepthook`.
+        # Do not call `app()`, because it would replace `sys.excepthook`.
         get_command(app)(args=arguments, prog_name="crossgrad")
     except Exception as error:
         user_error = error if isinstance(error, UserError) else failed_plugin(error)

@@ -142,7 +142,8 @@ _MOST: Final = 0.1
 #: Distance of a stray camera from the middle, divided by the distance of all other cameras and of
 #: the points.
 _FAR: Final = 10.0
-#: Quantile of the points' distances, because single points may be stray, too.
+#: Quantile of the points' distances that is used instead of the maximum, because single points may
+#: be stray, too.
 _OF_POINTS: Final = 0.9
 
 
@@ -381,7 +382,8 @@ def centers_of(views: Sequence[View]) -> NDArray[np.float64]:
 
 #: A median over fewer observed points is unreliable; points in the image are used instead.
 _FEWEST_SEEN = 3
-#: Points tested against the image of a view that observed too few.
+#: Maximum number of points that are tested against the image of a view that observed too few
+#: points.
 _MOST_TESTED = 50_000
 #: Significant bits of a length between cameras; further bits are rounding errors.
 _BITS = 40

@@ -246,7 +246,7 @@ class Schedule:
             length=length,
             lr_until=length,
             sh_interval=max(100, length // 30),
-            densify_from=0,  # `with_edits` plans these edits.
+            densify_from=0,  # `with_edits` sets the times of edits later.
             densify_until=0,
             densify_every=1,
             reset_every=length // 10 if length >= SHORTEST_RUN_WITH_RESET else None,
@@ -280,8 +280,8 @@ class Schedule:
         if self.counting.unit == "views" and not self.published:
             every = max(every, min(photos, (last - start) // USUAL_EDITS))
         if self.min_refinements:
-            # The warm-up is not shortened to one pass over the photos if one pass is longer than
-            # the warm-up.
+            # If one pass over the photos is longer than the warm-up, do not change the interval to
+            # one pass.
             whole = max(every, photos) if photos <= last // self.min_refinements else every
             start, every = _fitted(start, last, whole, photos, self.min_refinements)
         return replace(self, densify_from=start, densify_until=until, densify_every=every)

@@ -47,7 +47,7 @@ def all_finite_and_present(tensors: Sequence[Tensor | None]) -> list[tuple[bool,
             most = next(bits)
             results.append((most < _INFINITY, most > 0))
         elif not tensor.is_cpu and tensor.is_floating_point():
-            # Use one pass and one wait for the device.
+            # `largest` reads the tensor once and waits for the device once.
             value = float(largest(tensor))
             results.append((isfinite(value), value > 0.0))
         else:

@@ -35,7 +35,8 @@ def coalesced(gradient: Tensor | None) -> Tensor | None:
         return gradient.to_dense()
     rows = rows_of(gradient)
     if not gradient.is_coalesced() and _rises(rows):
-        gradient._coalesced_(True)  # Torch's own flag, so that torch does not sort again.
+        # Mark the tensor as coalesced, so that torch does not sort its rows again.
+        gradient._coalesced_(True)
     return gradient.coalesce()
 
 
@@ -83,7 +84,7 @@ class PackedRows:
         """Return a result of the column as a gradient of the whole tensor."""
         if result is None or self.rows is None:
             return result
-        # Torch's own flag, so that torch does not sort again.
+        # Mark the tensor as coalesced, so that torch does not sort its rows again.
         return sparse_rows(self.rows, result, self.shape)._coalesced_(self._tidy)
 
 

@@ -12,8 +12,8 @@ R = TypeVar("R")
 
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 _COMPILE = cast("Callable[..., Any]", njit)
-#: Allow fused multiply-add and ignore the sign of zero. All other arithmetic is IEEE in the written
-#: order, so NaN and infinity stay visible.
+#: Allow fused multiply-add and ignore the sign of zero. All other arithmetic follows IEEE 754 in
+#: the order of the source code, so NaN and infinity stay visible.
 _FLAGS = {"contract", "nsz"}
 
 

@@ -310,7 +310,7 @@ def _scale_by_power(at: Site, value: Any, shifted: Any) -> Any:
 def _sums(at: Site, *args: Any) -> Any:
     rows = list(args)
     for width in (1, 2, 4):
-        # Fold groups of `width` lanes onto their neighbours, two vectors into one.
+        # Add groups of `width` lanes to the neighbouring groups. Two vectors become one.
         starts = [s + o for s in range(0, LANES, 2 * width) for o in (0, LANES)]
         low = [start + lane for start in starts for lane in range(width)]
         high = [lane + width for lane in low]
@@ -343,7 +343,8 @@ ramp: Callable[[], Lanes] = emitted(_ramp(LANES), _eight)
 load: Callable[[_Array, int], Lanes] = emitted(_load(LANES), _eight, None, types.intp)
 #: Return one number of a flat float32 array in all lanes.
 broadcast: Callable[[_Array, int], Lanes] = emitted(_broadcast(LANES), _eight, None, types.intp)
-#: Return four consecutive numbers of a flat float32 array, twice.
+#: Return four consecutive numbers of a flat float32 array in lanes 0 to 3, and again in lanes 4 to
+#: 7.
 broadcast_four: Callable[[_Array, int], Lanes] = emitted(
     _broadcast_four(LANES), _eight, None, types.intp
 )
@@ -357,7 +358,7 @@ load_wide: Callable[[_Array, int], Lanes] = emitted(_load(WIDE), SIXTEEN, None, 
 broadcast_wide: Callable[[_Array, int], Lanes] = emitted(
     _broadcast(WIDE), SIXTEEN, None, types.intp
 )
-#: Return four consecutive numbers of a flat float32 array, four times.
+#: Return four consecutive numbers of a flat float32 array in each group of four lanes.
 broadcast_four_wide: Callable[[_Array, int], Lanes] = emitted(
     _broadcast_four(WIDE), SIXTEEN, None, types.intp
 )

@@ -183,7 +183,8 @@ def refuse_other_version(entry: Entry) -> None:
 
 def notes_on(error: BaseException) -> list[str]:
     """Return the notes on the step, hook and plugin in which an exception was raised."""
-    # Keep the order of the notes: the hook adds its note first.
+    # The hook adds its note before the step does. Reverse the notes, so that the note on the step
+    # comes first.
     return list(reversed(getattr(error, "__notes__", ())))
 
 

@@ -116,7 +116,7 @@ def _moved(camera: Camera, other: Scene, similarity: Similarity) -> Camera:
 def _are_trained(views: Sequence[View], trained: Sequence[View]) -> list[bool]:
     """Return for each view whether its pose is the pose of a training view."""
     centers, rotations = centers_of(trained), _rotations_of(trained)
-    # The trace of the rotation between two cameras falls with the angle between them.
+    # The trace of the rotation between two cameras decreases when the angle between them increases.
     least = 1.0 + 2.0 * math.cos(SAME_DIRECTION)
 
     def is_trained(center: NDArray[np.float64], rotation: NDArray[np.float64]) -> bool:

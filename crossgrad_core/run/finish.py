@@ -28,7 +28,8 @@ from crossgrad_core.training.state import PhaseTimer, RollbackGuard, TrainingFai
 from crossgrad_core.training.step import final_edits
 from crossgrad_core.wording import one_line
 
-#: Texts in errors of torch that mean out of memory; some of these errors also have their own type.
+#: Texts in torch errors that report exhausted memory. Some of these errors also have their own
+#: type.
 _NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory")
 
 
@@ -67,8 +68,8 @@ def _place(error: BaseException) -> str:
     return f" ({Path(last.filename).name}, line {last.lineno}, in {last.name})"
 
 
-#: A run whose last evaluation is more than this many decibels below its best one reports it. With
-#: few held-out photos, single evaluations always differ by smaller amounts.
+#: A run reports if its last evaluation is more than this many decibels below its best evaluation.
+#: With few held-out photos, smaller differences between evaluations are normal.
 WORSE: Final = 0.3
 _T = TypeVar("_T")
 
@@ -156,7 +157,8 @@ class RunLoop:
                     return
                 revised = length.revised(self.setup, state)
                 if revised is not self.setup:
-                    # Do not allow a rollback to a step before the length changed.
+                    # Copy the state, so that a later rollback cannot return to a step before the
+                    # change of length.
                     guard.copy(state)
                 # If the configuration is the same object, the planned length is already written.
                 if revised.config is not self.setup.config:

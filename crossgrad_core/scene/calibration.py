@@ -207,7 +207,7 @@ class Calibration:
         import pycolmap
 
         options = pycolmap.UndistortCameraOptions()
-        # This also refuses models without a pinhole equivalent, before `_reach` is computed.
+        # This call also refuses models without a pinhole equivalent, before `_reach` is computed.
         smallest = self._undistorted(options).width <= options.min_scale * self.width
         if smallest and (self._reach.folds or self._reach.wide):
             options.min_scale = 1.0

@@ -166,7 +166,8 @@ def mark_of(path: Path) -> FileMark:
 
 def _files_of(view: View) -> tuple[FileMark | None, FileMark | None]:
     photo = view.photo
-    if not isinstance(photo, FilePhoto):  # Photos of plugins may come from any source.
+    # Photos of plugins may come from other sources than files.
+    if not isinstance(photo, FilePhoto):
         return None, None
     mask = photo.source.mask
     return mark_of(photo.source.path), None if mask is None else mark_of(mask)
@@ -194,9 +195,10 @@ class Weight(IntEnum):
 
     #: Only pixels or points differ; all cameras and parameters are unchanged.
     CONTENT = 1
-    #: Other views are held out.
+    #: Other views are held out than before.
     HELD_OUT = 2
-    #: Other views are trained, or cameras moved, so the parameters would be misplaced.
+    #: Other views are trained than before, or cameras moved. The trained parameters would be at
+    #: wrong positions.
     PLACE = 3
 
 
@@ -223,7 +225,7 @@ def differences(was: Fingerprint, now: Fingerprint) -> list[Difference]:
     if not any(change.weight is Weight.PLACE for change in changes):
         changes += _frame(was, now) or [*_cameras(was, now), *_points(was, now)]
     changes += _files(was, now)
-    # If a difference was found, it is listed, and other changed files are not reported in addition.
+    # Report other changed files only if no difference was found so far.
     return changes or _others(was, now)
 
 

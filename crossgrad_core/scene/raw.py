@@ -19,7 +19,8 @@ from crossgrad_core.scene.wording import count, name_some
 FARTHEST = 1e30
 #: Largest coordinate in local units: its square must stay within float32.
 FARTHEST_LOCAL = 1e15
-#: Bytes of a file or folder name, and of a whole path, allowed on every usual file system.
+#: Largest number of bytes of a file or folder name, and of a whole path, that usual file systems
+#: allow.
 LONGEST_PART, LONGEST_NAME = 255, 1024
 _NO_SIGNS = {"Cc", "Cs"}  # control characters, and bytes that are not UTF-8
 # Rotations written with six digits pass; a pose that contains a scale fails.

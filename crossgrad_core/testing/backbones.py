@@ -199,7 +199,8 @@ def edits_keep_rows_together(make: Make[Backbone]) -> None:
     backbone = make()
     before = created(backbone)
     rows = primitives_of(backbone.blocks(), before)
-    # Drops the last two primitives, repeats the first two at the end, and reverses the rest.
+    # Drop the last two primitives, repeat the first two at the end, and reverse the remaining
+    # primitives.
     source = torch.cat([torch.arange(rows - 3, -1, -1), torch.tensor([0, 1])])
     after = _edited(backbone, before, source)
     for block in backbone.blocks():

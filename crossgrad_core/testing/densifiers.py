@@ -174,7 +174,7 @@ def _directions(radii: Tensor, gradient: Tensor, rng: np.random.Generator) -> Te
 def _backbone_for(densifier: Densifier) -> Backbone:
     """Return a backbone that uses this densifier by default, or that has the tensors it edits."""
     fitting = []
-    # Of several suitable backbones, use the first one, which is crossgrad's own.
+    # If several backbones are suitable, use the first one. Crossgrad's own backbones come first.
     candidates = sorted(
         entries("backbones").values(), key=lambda entry: entry.distribution != "crossgrad"
     )
@@ -184,7 +184,7 @@ def _backbone_for(densifier: Densifier) -> Backbone:
             have = {tensor for block in backbone.blocks() for tensor in block.tensors}
             default = load("densifiers", backbone.default_densifier)
         except (Exception, SystemExit):
-            # If a backbone of another package is broken, the densifier is not the cause.
+            # If a backbone of another package is broken, this is not an error of the densifier.
             continue
         if densifier.tensors <= have:
             fitting.append((type(densifier) is not default, backbone))

@@ -330,7 +330,8 @@ def _combine_chunk(
         for i in range(result.size):
             result[i] = 0.0
     elif count == 2 and (out == rows[0] or out == rows[1]):
-        # The most common case: two views, one of them overwritten. Both sums are commutative.
+        # The most common case has two views, and the result overwrites the gradient of one view.
+        # The order of the two summands has no effect.
         this = 0 if out == rows[0] else 1
         a, b = row(out, first, end - first), row(rows[1 - this], first, end - first)
         if plain:

@@ -141,7 +141,7 @@ def commit(package: Path = Path(__file__).parents[2]) -> str | None:
 
 
 def _git(root: Path, *arguments: str) -> str:
-    # Without locks: others may commit while a run only reads.
+    # Take no locks, so that other processes can commit while a run reads.
     command = ["git", "--no-optional-locks", "-C", str(root), *arguments]
     done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=20)
     return done.stdout.strip()

@@ -58,7 +58,7 @@ def chosen_views(views: "Sequence[View]", count: int) -> "tuple[View, ...]":
     groups = [[view for view in views if view.regime == regime] for regime in regimes]
     share = [0] * len(groups)
     for _ in range(min(count, len(views))):
-        # The first of the regimes with the fewest chosen views gets one more.
+        # Among the regimes with the fewest chosen views, the first regime gets one more view.
         unused = [i for i, group in enumerate(groups) if share[i] < len(group)]
         share[min(unused, key=share.__getitem__)] += 1
     chosen = {

@@ -12,7 +12,7 @@ from crossgrad_core.system.text_files import read_json
 
 #: The file with name -> path of the source.
 FILE: Final = "sources.json"
-#: The name of the camera path that comes from no file.
+#: The name of the built-in camera path, which does not come from a file.
 RESERVED: Final = ("zoom",)
 
 

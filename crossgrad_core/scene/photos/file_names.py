@@ -108,7 +108,7 @@ class FileNames:
         for likeness, files in best.values():
             for file in files:
                 claims[file].append(likeness)
-        # A file is not paired with this name if another name is more similar to its path.
+        # Do not pair a file with this name if another name is more similar to the file's path.
         held = {
             name: (likeness, [file for file in files if likeness == max(claims[file])])
             for name, (likeness, files) in best.items()

@@ -92,7 +92,7 @@ def _most_pixels(image: "Image", file: BinaryIO, size: int) -> float:
     A header that claims more pixels would make the decoder allocate memory for a missing photo.
     """
     if image.format in {"JPEG", "MPO"}:
-        # A block of 8 x 8 pixels needs at least one bit, the Huffman code of its mean.
+        # Each block of 8 x 8 pixels needs at least one bit: the Huffman code of its mean.
         return _JPEG_PIXELS_PER_BYTE * size
     if image.format == "PNG":
         file.seek(_PNG_DEPTH)

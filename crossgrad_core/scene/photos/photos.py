@@ -28,7 +28,8 @@ from crossgrad_core.scene.photos.decode import (
 from crossgrad_core.scene.photos.photo_store import Decoded, PhotoStore, Storable, made_by
 from crossgrad_core.scene.photos.shapes import is_turned
 
-#: JPEG files are decoded at an eighth of their sides for the test, which reads all of their data.
+#: For the test, JPEG files are decoded at an eighth of their width and height. This still reads all
+#: data of the file.
 SMALLEST = 8
 _OPAQUE, _HALF = 255, 128
 #: Seconds to wait for a photo that another thread is decoding.

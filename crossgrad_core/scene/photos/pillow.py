@@ -181,6 +181,6 @@ def _registered() -> bool:
         from pillow_heif import register_heif_opener
     except ImportError:
         return False
-    # Photos are already decoded in several threads.
+    # Use one thread here, because photos are already decoded in several threads.
     register_heif_opener(thumbnails=False, decode_threads=1)
     return True

@@ -56,7 +56,7 @@ def adam_step(  # noqa: PLR0913 - the step of an optimizer without an object tha
     """
     _check(params, grads, rule.betas)
     given = {name: grad for name in params if (grad := grads.get(name)) is not None}
-    # Look it up before the first step is counted.
+    # Look up the coefficients before the first step is counted.
     numbers = {name: (lrs[name], 1.0 if scales is None else scales[name]) for name in given}
     updates = []
     for name, grad in given.items():
@@ -139,7 +139,7 @@ def update_on_gpu(
         [exp_avg],
         [exp_avg_sq],
         [],
-        # The function adds 1 first.
+        # The function adds 1 to the step count first.
         [torch.full((), step.age - 1, dtype=torch.float32, device=param.device)],
         fused=True,
         amsgrad=False,

@@ -66,7 +66,7 @@ def _usual(scales: Tensor) -> Tensor | float:
     sample = scales[:: -(-len(scales) // _SAMPLE)]
     if is_native([sample]):  # NumPy has less overhead than torch.
         rows = sample.numpy()
-        # NaN comes last, as in torch's sort.
+        # Sort NaN to the end, as torch does.
         a, b, c = np.where(np.isnan(rows), np.float32(inf), rows).T
         lengths = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
         lengths = lengths[np.isfinite(lengths)]

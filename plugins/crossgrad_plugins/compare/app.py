@@ -237,7 +237,7 @@ def _lines(table: Table) -> Iterator[str]:
 
 #: Name of the default output folder, next to the runs.
 FOLDER: Final = "compare"
-#: Names of all figures that a comparison can draw.
+#: Names of all plots that a comparison can draw.
 DRAWINGS: Final = (
     *(f"curves_{cost.name}" for cost in COSTS),
     *("differences", "frontier", "phases", "primitives", "profile", "regimes"),

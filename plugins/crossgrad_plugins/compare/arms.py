@@ -18,7 +18,7 @@ _FIRST: Final = (
 #: Settings that have a shorter name in the names of arms.
 _SPOKEN: Final = {"views_per_step": "views"}
 _DIGITS: Final = re.compile(r"(\d+)")
-#: Names of the settings for scene and seed.
+#: Values of the settings for scene and seed.
 Problem: TypeAlias = tuple[str, int]
 Length: TypeAlias = tuple[str, float]
 
@@ -74,7 +74,7 @@ def _grouped(runs: Sequence[Run]) -> list[tuple[str, list[Run]]]:
         arms = _by_labels(runs)
         if len({name for name, _ in arms}) == len(arms):
             return arms
-    # A run with two labels is listed twice.
+    # Keep a run only once, because a run with two labels is listed twice.
     return _by_settings(list({run.name: run for run in runs}.values()))
 
 

@@ -22,7 +22,7 @@ from crossgrad_plugins.compare.ranking import Standing
 from crossgrad_plugins.compare.run import Run
 from crossgrad_plugins.compare.targets import is_inside, shared_amount, value_at
 
-#: Position at which the contrasts of the main table are taken: the end of the runs.
+#: The main table compares the arms at this position: the end of the runs.
 END = "at the end"
 OVERALL = "overall"
 #: With at most this many arms, every table has a row for every pair of arms.

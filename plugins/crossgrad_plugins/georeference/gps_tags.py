@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 Numbers: TypeAlias = tuple[float, float, float]
 _IFD: Final = 0x8825
 _SOUTH_OR_WEST: Final = {"S", "W"}
-#: EXIF values of altitudes below sea level, and below the ellipsoid.
+#: EXIF values of altitude references for altitudes below sea level and below the ellipsoid.
 _BELOW: Final = {1, 3}
 _STEPS: Final = (1.0, 60.0, 3600.0)
 

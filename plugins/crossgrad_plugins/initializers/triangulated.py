@@ -178,7 +178,7 @@ def _pairs(views: Sequence[View], neighbours: int) -> list[tuple[int, int]]:
     pairs: set[tuple[int, int]] = set()
     for i in range(len(views)):
         distances = np.linalg.norm(centers - centers[i], axis=1)
-        # Cameras at the same position give no depth.
+        # Cameras at the same position cannot determine depth.
         distances[(axes @ axes[i] < _ASKEW) | (distances == 0.0)] = np.inf
         near = np.argsort(distances, kind="stable")[:neighbours]
         pairs |= {(min(i, j), max(i, j)) for j in near.tolist() if np.isfinite(distances[j])}
@@ -235,7 +235,7 @@ def _matched(
     alike[rows, nearest] = -1.0
     rival = alike.max(axis=1)
     alike[rows, nearest] = best
-    # Descriptors have length 1: their squared distance is 2 - 2 cos.
+    # Descriptors have length 1, so their squared distance is 2 - 2 cos.
     clear = (1.0 - best) < _RATIO**2 * (1.0 - rival)
     mutual = alike.argmax(axis=0)[nearest] == rows
     chosen = np.flatnonzero(clear & mutual)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 _BAR = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
 
-#: Counts that most steps report and that are therefore not shown.
+#: Counts that are not shown, because most steps report them.
 _OF_AGGREGATION = frozenset({"zero", "disjoint", "dropped", "conflict"})
 
 

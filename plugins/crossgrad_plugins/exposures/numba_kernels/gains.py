@@ -45,7 +45,8 @@ _OFFSET, _STRETCH = np.float32(OFFSET), np.float32(STRETCH)
 _SLOPE, _EXPONENT = np.float32(SLOPE), np.float32(EXPONENT)
 _ROOT = np.float32(1.0 / EXPONENT)
 _THRESHOLD, _THRESHOLD_LINEAR = np.float32(THRESHOLD), np.float32(THRESHOLD_LINEAR)
-# df/dstops divided by f + o in the power part of the curve, and by f in its straight part.
+# df/dstops divided by f + o in the power part of the sRGB curve, and divided by f in the straight
+# part.
 _OF_POWER, _OF_LINE = np.log(2.0) / EXPONENT, np.log(2.0)
 
 
@@ -135,8 +136,8 @@ def expose_back(
             values, after = load(image, start + lane), load(taken, start + lane)
             given = load(upstream, start + lane)
             before_line, after_line = values <= dark, after <= dark
-            # A value that leaves the straight part is divided by the product of itself and the
-            # exponent.
+            # If a value leaves the straight part of the curve, it is divided by the product of the
+            # value and the exponent.
             below = where(before_line, exponent * values, values + offset)
             above = where(after_line, exponent * after, after + offset)
             slope = where(
