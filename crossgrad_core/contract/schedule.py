@@ -280,8 +280,7 @@ class Schedule:
         if self.counting.unit == "views" and not self.published:
             every = max(every, min(photos, (last - start) // USUAL_EDITS))
         if self.min_refinements:
-            # If one pass over the photos is longer than the warm-up, do not change the interval to
-            # one pass.
+            # The interval is at least one pass over the photos, if this leaves enough edits.
             whole = max(every, photos) if photos <= last // self.min_refinements else every
             start, every = _fitted(start, last, whole, photos, self.min_refinements)
         return replace(self, densify_from=start, densify_until=until, densify_every=every)

@@ -79,8 +79,9 @@ def growth_ahead(setup: Setup, crowd: PrimitiveCounts, schedule: Schedule, step:
         return 1.0
     ahead = schedule.edits(step)
     if ahead and setup.numbers.growth == "budget":
-        # The limit is needed for time budgets that no run uses up, for example near the published
-        # length.
+        # Some primitive budgets are larger than the number of primitives that any run reaches, for
+        # example near the published length. The limit avoids that the cost is overestimated in
+        # these runs.
         return min(1.0 + COST_PER_EDIT * COUNTED_EDITS, _along_curve(setup, crowd, schedule, step))
     done = schedule.edits_before + schedule.edits() - ahead
     return 1.0 + COST_PER_EDIT * min(ahead, max(0, COUNTED_EDITS - done))

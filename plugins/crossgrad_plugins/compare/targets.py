@@ -14,8 +14,8 @@ from crossgrad_plugins.compare.run import Run
 
 #: The performance profile is drawn up to this ratio.
 LARGEST_RATIO = 4.0
-#: The last value of a run is used if the run ends earlier than another run by at most this relative
-#: amount. The length of a run with a time limit is a whole number of steps.
+#: A run may end earlier than an amount by this share, and its last value still counts for the
+#: amount. The reason is that the length of a run with a time limit is a whole number of steps.
 _SAME_END = 0.03
 
 

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from crossgrad_plugins.diagnostics.grouped import GroupedGramian, Groups, split_of
 from crossgrad_plugins.diagnostics.resampling import Resamples
 
-#: The share of sigma_w^2 in the variance decides how the error of the ratio's interval is
-#: distributed. If this share is above the second value, the first value is the share of the error
-#: that moves from the lower to the upper end. A sample with too few long gradients makes sigma_w^2
-#: too small and the ratio too large.
+#: First value: maximum share of the error of the ratio's interval that moves from the lower to the
+#: upper end. Second value: if sigma_w^2 contributes at least this share of the variance, the
+#: maximum applies. A sample with too few long gradients makes sigma_w^2 too small and the ratio too
+#: large.
 _MOVED = 0.4
 _WITHIN_RULES = 1.0 / 3.0
 #: The unbiased estimate of tr(Sigma^2) needs four views of each group.
@@ -280,8 +280,8 @@ def inverted(pivot: Callable[[float], Pivot], start: float, level: float) -> Int
         start: Positive value of about the size of the upper end.
         level: Confidence level of the interval.
     """
-    # If 0 is rejected as too small, the interval is unknown: all larger values are rejected too,
-    # and [0, 0] would wrongly claim exactly 0.
+    # If the value 0 is rejected as too large, all larger values are rejected too. The interval [0,
+    # 0] would then wrongly claim exactly 0.
     if not pivot(0.0).above(level, lower_end=False):
         return UNKNOWN
     return Interval(

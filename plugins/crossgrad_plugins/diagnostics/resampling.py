@@ -122,8 +122,8 @@ class Resamples:
         far = GroupResamples.of(parts.far, parts.far_along, multiplicities(m, resamples, rng))
         (f, g), (p, q) = groups.unseen, groups.shares
         p, q = p * groups.divisors[0], q * groups.divisors[1]
-        # If all views of a group are finite in number, only the share of the noise's variance from
-        # views without a measurement remains.
+        # The views of a group are finite in number, so the variance of the noise is multiplied by
+        # the share of views without a measurement.
         root_f, root_g = f**0.5, g**0.5
         near_spread = near.spread[0] + root_f * (near.spread - near.spread[0])
         far_spread = far.spread[0] + root_g * (far.spread - far.spread[0])

@@ -49,8 +49,8 @@ class Affine(ExposurePerPhoto):
     @override
     def shift(self, name: str, values: Tensor, start: Tensor, end: Tensor) -> Tensor:
         # Do not add the difference of the maps: this would change the relative exposure of the
-        # photos and could make dark values negative. Apply the map of the photo after `end` and
-        # before the inverse of `start`.
+        # photos and could make dark values negative. The new map applies `end` first, then the
+        # inverse of `start`, and then the map of the photo.
         inverse, failed = torch.linalg.inv_ex(start[:, :3])
         if failed or not inverse.abs().max() < _LARGEST_INVERSE:
             return super().shift(name, values, start, end)

@@ -40,7 +40,8 @@ from crossgrad_plugins.readers.colmap_files.folder import check_scene_folder
 from crossgrad_plugins.readers.place.place import at, by_gps
 
 _TERMS: Final = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
-#: The field for rolling shutter compensation, and its values that mean no compensation.
+#: The field for rolling shutter compensation, and the values of the field that mean no
+#: compensation.
 _ROLLING: Final = "rolling_shutter"
 _OFF: Final = frozenset({"false", "0", "no", "off", "none", "disabled"})
 _GLOBAL: Final = (

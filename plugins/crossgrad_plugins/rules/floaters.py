@@ -26,10 +26,10 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: Percentile of the depths of a camera's SfM points that is used as the nearest depth, because
-#: single points are often wrong.
+#: The nearest depth of a camera is this percentile of the depths of its SfM points. The minimum is
+#: not used, because single points are often wrong.
 NEAREST: Final = 1.0
-#: A camera that observes fewer points than this does not show which space is empty.
+#: A camera that observes fewer points than this gives no reliable information about empty space.
 FEWEST_SEEN: Final = 8
 
 
