@@ -11,9 +11,9 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 HERE = Path(__file__).parent
 DATA = HERE / "paper_data"
-#: Number of methods that are run and compared on each of the other backbones.
+#: Number of methods that are also run and compared on each of the other backbones.
 BEST = 2
-#: Grids as stored in the repository.
+#: Folder of the grids that are stored in the repository.
 GRIDS = HERE / "grids" / "paper"
 
 #: Expected relation of the first arm to the second arm.

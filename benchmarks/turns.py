@@ -131,7 +131,7 @@ def beside(case: Path, other: Path, threads: int, rounds: int) -> dict[str, Any]
     workers = [Worker(HERE, case, threads, core), Worker(other, case, threads, core)]
     seconds: list[list[float]] = [[], []]
     for turn in range(WARM_UP + rounds):
-        # The sides alternate in being first.
+        # The two checkouts take turns at making the first step of a round.
         for side in (0, 1) if turn % 2 else (1, 0):
             took = workers[side].step()
             if turn >= WARM_UP:

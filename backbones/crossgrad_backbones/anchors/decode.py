@@ -27,7 +27,8 @@ from crossgrad_core.numerics.jobs import parallel
 from crossgrad_core.plugin import Camera, Gaussians
 
 Gradients: TypeAlias = tuple[Tensor | None, ...]
-#: Indices of opacity, covariance and colour, and the index of the covariance among them.
+#: Indices of the outputs for opacity, covariance and colour, and index of the covariance among
+#: these three.
 _HEADS, _COVARIANCE = (0, 1, 2), 1
 #: Index of the scales among means, quaternions, scales, opacities and colours.
 _SCALES = 2

@@ -16,7 +16,7 @@ from crossgrad_plugins.sweep.attempt import Outcome, Retries, Worker, carried_ou
 from crossgrad_plugins.sweep.engines import Work
 from crossgrad_plugins.sweep.job import Job
 
-#: Options that are passed to sbatch unchanged.
+#: Options that the sweep passes to sbatch unchanged.
 SBATCH: Final = (
     *("partition", "account", "qos", "constraint", "exclude", "nodelist", "gres", "comment"),
 )
