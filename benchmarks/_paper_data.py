@@ -263,7 +263,7 @@ class Figure:
     value: float | None
 
 
-#: Table -> method -> its figures, in the order of the paper.
+#: Table -> method -> its values, in the order of the paper.
 Tables: TypeAlias = Mapping[str, Mapping[str, list[Figure]]]
 
 

@@ -25,8 +25,7 @@ from crossgrad_plugins.compare.quantity import Quantity
 from crossgrad_plugins.compare.run import Run
 
 PSNR = Quantity.of("psnr")
-#: Number of adjacent rows in a group, number of selections that alternate, and shares of the rows
-#: that are rendered.
+#: Row of the table -> names of its regimes in the scenes. None stands for all views.
 REGIMES = {"overall": (None,), "far": ("far", "aerial"), "near": ("near", "street")}
 #: Key of summary.json -> title of the column.
 NUMBERS = {"step": "steps", "views": "views", "primitives": "Gaussians", "cpu_seconds": "CPU s"}

@@ -45,7 +45,8 @@ if TYPE_CHECKING:
 STEP = 5_010
 #: A step in which density control edits.
 EDIT = 5_100
-#: Number of steps before the measurement. They compile kernels, decode photos and fill memory.
+#: Number of steps before the measurement. These steps compile kernels, decode photos and fill
+#: memory.
 WARM_UP = 3
 #: Number of photos in each direction.
 PHOTOS = 4

@@ -159,7 +159,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         user_error = error if isinstance(error, UserError) else failed_plugin(error)
         if user_error is None and isinstance(error, OSError) and is_too_long(error):
             user_error = path_too_long(error.filename)
-        if user_error is None:  # Bugs of crossgrad keep their traceback.
+        if user_error is None:  # An error that is a bug of crossgrad keeps its traceback.
             raise
         finish()
         print(f"error: {user_error}", file=sys.stderr)  # noqa: T201

@@ -81,7 +81,7 @@ def _own(
 
 
 #: Options that are not settings. The help shows them before the settings, after the first setting
-#: of the results, or last.
+#: that concerns results, or last.
 _FRONT: Final = (
     _own(
         "config",

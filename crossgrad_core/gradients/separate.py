@@ -120,7 +120,8 @@ class DenseGradients(SeparateGradients):
     @override
     def overlap(self, granularity: Granularity) -> NDArray[np.bool_]:
         gramians, present = self.gramians(granularity), self.present(granularity)
-        # Gradients with a non-zero dot product share an element; only the other pairs need a check.
+        # Gradients with a non-zero dot product share an element, so only pairs with a zero dot
+        # product need a check.
         shared: NDArray[np.bool_] = gramians != 0
         doubtful = ~shared & present[:, :, None] & present[:, None, :]
         for i, j in np.argwhere(np.triu(doubtful.any(axis=0), 1)).tolist():

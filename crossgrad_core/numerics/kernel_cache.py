@@ -199,7 +199,7 @@ class _Files:
     def _drop_older(self) -> None:
         for path in self._folder.glob(f"{self._base}.*"):
             if not path.name.startswith(self._generation) and path.suffix != ".tmp":
-                # Another process may have removed it first, or may hold it open.
+                # Another process may have removed the file first, or may hold the file open.
                 with suppress(OSError):
                     path.unlink()
 

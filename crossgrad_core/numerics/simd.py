@@ -274,7 +274,7 @@ def _parts(at: Site, array: Any, index: Any, count: int = 3) -> list[Any]:
 
 def _prefetch(at: Site, array: Any, index: Any, *, write: int) -> Any:
     address = _element(at, array, index, _BYTE)
-    # Keep the line in all cache levels (3); it holds data, not instructions (1).
+    # The cache line stays in all cache levels (3). It contains data, not instructions (1).
     _llvm("llvm.prefetch.p0", ir.VoidType())(at, address, _INT(write), _INT(3), _INT(1))
     return at.context.get_dummy_value()
 

@@ -299,7 +299,8 @@ def _offers(path: tuple[str, ...]) -> dict[str, tuple[Entry, ...]]:  # noqa: ARG
     """Return slot -> entries; `path` is `sys.path`, so that a changed path is scanned again."""
     from importlib.metadata import entry_points
 
-    # One call without a filter, because each call scans every installed distribution.
+    # Call `entry_points` once and without a filter, because each call scans every installed
+    # distribution.
     points = entry_points()
     offers_by_slot: dict[str, tuple[Entry, ...]] = {}
     groups = [*OFFERED.items(), (PLANNERS, f"crossgrad.{PLANNERS}")]

@@ -33,7 +33,7 @@ GROUPS: Final[dict[str, str]] = {
 }
 #: Slots that a run fills with a list of components.
 LISTS: Final = ("metrics", "observers")
-#: Slots that a run fills with any number of components; `rules` is a mapping of names.
+#: Slots that a run fills with any number of components. The value of `rules` is a mapping of names.
 MANY: Final = (*LISTS, "rules")
 #: The group of commands that packages add to `crossgrad`; not a slot of a run.
 COMMANDS: Final = "commands"

@@ -19,8 +19,8 @@ from crossgrad_core.training.setup import Setup
 #: A view counts as a training view if its pose is nearer to a training pose than these limits:
 #: local units (extents), and radians.
 SAME_PLACE, SAME_DIRECTION = 1e-3, 1e-2
-#: The capture is accepted if at least this share of its points is inside the box around the run's
-#: points and cameras, enlarged by this factor.
+#: A capture is accepted if at least the first value, a share of its points, is inside a box. The
+#: box contains the run's points and cameras and is enlarged by the second value, a factor.
 LEAST_SHARED, MARGIN = 0.1, 1.1
 #: Points of two captures of one place are on the same surfaces. Their median distance from the
 #: run's points is at most this share of the median after any of `TURNS` random rotations about the

@@ -174,9 +174,9 @@ def check_settings(config: RunConfig, checkpoint: Checkpoint) -> None:
     # a component may be a change.
     known_components = {key.partition(".")[0] for key in stored}
     both = {key for key in ours.keys() | stored.keys() if key.partition(".")[0] in known_components}
-    # Ignore settings that only one of the two has, if they are options of the rasterizer or
-    # settings of the length. Another rasterizer has other options. A run with a time budget lacks
-    # the settings of the length.
+    # Ignore settings that only the configuration or only the checkpoint contains, if they are
+    # options of the rasterizer or settings of the length. Another rasterizer has other options. A
+    # run with a time budget lacks the settings of the length.
     either = {_DRAWN, "steps", "revisions", "revised"}
     both -= {k for k in ours.keys() ^ stored.keys() if k.partition(".")[0] in either}
     changed = sorted(key for key in both if ours.get(key) != stored.get(key))
@@ -280,7 +280,7 @@ def _record(plain: dict[str, Any] | None) -> StepRecord | None:
 
 
 _LOG = logging.getLogger(__name__)
-#: Slot -> default component that replaces a missing one.
+#: Slot -> default component that replaces a missing component.
 _PLAIN: Final = {
     "sampler": defaults.SAMPLER,
     "operator": defaults.OPERATOR,

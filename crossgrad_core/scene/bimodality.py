@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 ONE_MODE: Final = 0.555
 #: Smallest sample for which the finite-sample kurtosis is defined.
 _SMALLEST = 4
-#: Minimum sample size: in smaller samples, two equal points stay below the uniform value in the
-#: finite-sample form (docs/groupings.md).
+#: Minimum sample size. In a smaller sample with values at only two points, the finite-sample
+#: coefficient stays below the value of a uniform sample (docs/groupings.md).
 _SMALLEST_SAMPLE = 10
 
 

@@ -11,8 +11,8 @@ from crossgrad_core.contract.scene import Similarity, stray_rows
 # of all training cameras (3DGS).
 _MARGIN = 1.1
 
-# If the distance between cameras is below this share of their distance to the scene, it is not used
-# as the unit.
+# If the distance between cameras is below this share of their distance to the scene, the distance
+# between cameras is not used as the unit.
 _SAME_PLACE = 1e-6
 
 # A smaller size, in input units, is treated as 0, because its inverse must be finite.

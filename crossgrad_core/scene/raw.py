@@ -23,7 +23,8 @@ FARTHEST_LOCAL = 1e15
 #: allow.
 LONGEST_PART, LONGEST_NAME = 255, 1024
 _NO_SIGNS = {"Cc", "Cs"}  # control characters, and bytes that are not UTF-8
-# Rotations written with six digits pass; a pose that contains a scale fails.
+# Tolerance of the test for rigid rotations. Rotations written with six digits pass, and a pose that
+# contains a scale fails.
 _RIGID = 1e-4
 
 

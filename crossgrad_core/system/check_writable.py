@@ -42,7 +42,7 @@ def check_folder(folder: Path, needed: int = 0) -> None:
             todo="choose another path, or remove the file",
         )
     try:
-        # Permission bits are not reliable on network file systems; a test file is.
+        # Write a test file, because permission bits are not reliable on network file systems.
         with disk_errors(folder), tempfile.TemporaryFile(dir=existing) as probe:
             probe.write(b"crossgrad")
     except OSError as error:  # Some file systems, such as /proc, raise a special kind of error.

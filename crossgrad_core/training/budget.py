@@ -80,8 +80,8 @@ def growth_ahead(setup: Setup, crowd: PrimitiveCounts, schedule: Schedule, step:
     ahead = schedule.edits(step)
     if ahead and setup.numbers.growth == "budget":
         # Some primitive budgets are larger than the number of primitives that any run reaches, for
-        # example near the published length. The limit avoids that the cost is overestimated in
-        # these runs.
+        # example near the published length. Without the limit, the cost of these runs would be
+        # overestimated.
         return min(1.0 + COST_PER_EDIT * COUNTED_EDITS, _along_curve(setup, crowd, schedule, step))
     done = schedule.edits_before + schedule.edits() - ahead
     return 1.0 + COST_PER_EDIT * min(ahead, max(0, COUNTED_EDITS - done))
@@ -148,7 +148,9 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
     first = _without_edits(schedule_for(setup, fits), max(fits, 2 * PROBE_STEPS))
     pixels = setup.selection.resolution.pixels(first, PROBE_STEPS) / first.pace.views(PROBE_STEPS)
     if pixels < 1.0:
-        del state  # The resolution state of this run stores the scale that the views have reached.
+        # Delete this state, because its resolution state stores the scale that the views have
+        # reached.
+        del state
         state = first_state(unwatched(setup))
         steps, small = _probed(replace(probed, schedule=first), state, seconds)
         note += f" at full size, {steps} at first {small * first.pace.at(1) * 1000:.1f} ms"

@@ -30,7 +30,7 @@ from crossgrad_core.training.state import (
 from crossgrad_core.training.step import model_of, sample_context, take_step
 from crossgrad_core.training.views import photo_camera
 
-#: Messages at the first and at the second signal; A third signal ends the process.
+#: Messages at the first and at the second signal. A third signal ends the process.
 _WORDS = (
     (
         "stopping: the current state is saved and evaluated first (press again to "

@@ -17,8 +17,8 @@ STANDING = 6
 #: new parameters and moments.
 EDIT = 3
 #: Memory of the autograd graph of one view until its backward pass ends, in units of the parameters
-#: or of the decoded tensors of the view, whichever is larger. Measured with the numba rasterizer:
-#: 2.7.
+#: or of the decoded tensors of the view, whichever is larger. With the numba rasterizer, the
+#: measured value is 2.7.
 GRAPH = 3
 #: Share of the available memory that growth may claim.
 GROWTH_SHARE = 0.5

@@ -138,7 +138,7 @@ def observed_views(
         NonFiniteError: The loss of the extra view is not finite.
     """
     if setup.config.densify_views == "one":
-        # Use the view at another position of the sample in each step, because a sampler may always
+        # In each step, use the view at another position of the sample, because a sampler may always
         # put the same group first.
         return (records[state.step % len(records)],)
     wanted = setup.schedule.grows and setup.schedule.collects(state.step)

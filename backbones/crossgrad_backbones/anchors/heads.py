@@ -17,7 +17,7 @@ from typing_extensions import override
 from crossgrad_core.numerics.elementwise import sigmoid
 from crossgrad_core.plugin import Block, BlockKind, Gaussians, LearningRate, Parameters
 
-#: Width of the direction from the camera to the anchor.
+#: Number of values of the direction from the camera to the anchor.
 DIRECTION = 3
 #: Indices of the two linear layers. The ReLU between them has index 1.
 LAYERS = (0, 2)

@@ -42,7 +42,8 @@ def largest_bits(
         size, first = sizes[tensor], (part - starts[tensor]) * PART
         bits = carray(float32_pointer(addresses[tensor]), size).view(np.uint32)
         part_bits = bits[first : min(size, first + PART)]
-        # Read four streams at a time, which waits less for memory than one stream.
+        # Read four streams at a time. The processor then waits less for memory than with one
+        # stream.
         quarter = len(part_bits) // 4
         p, q = part_bits[:quarter], part_bits[quarter : 2 * quarter]
         r, s = part_bits[2 * quarter : 3 * quarter], part_bits[3 * quarter : 4 * quarter]

@@ -73,7 +73,7 @@ def create_run_folder(
         raise disk_full(wanted, needed)
     with disk_errors(wanted):
         folder = _made(wanted, taken=out is not None)
-        # Permission bits are not reliable on network file systems; a test file is.
+        # Write a test file, because permission bits are not reliable on network file systems.
         with tempfile.TemporaryFile(dir=folder) as probe:
             probe.write(b"crossgrad")
     return folder

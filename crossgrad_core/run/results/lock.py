@@ -26,7 +26,7 @@ _TAKEN = frozenset({errno.EAGAIN, errno.EACCES, errno.EWOULDBLOCK, errno.EDEADLK
 # Windows locks ranges of bytes, which other processes then cannot read. Lock a byte far after the
 # content.
 _FAR = 2**30
-_MOST = 4096  # most bytes of a holder's description
+_MOST = 4096  # maximum number of bytes of the lock holder's description
 
 
 @dataclass(frozen=True)

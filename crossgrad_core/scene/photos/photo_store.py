@@ -164,7 +164,7 @@ class PhotoStore:
         for last_used, length, path in entries:
             if used + size <= self._limit or last_used >= self._begun:
                 break
-            # Another process may have replaced the file first, or may hold it open.
+            # Another process may have replaced the file first, or may hold the file open.
             with suppress(OSError):
                 path.unlink()
                 used -= length

@@ -145,7 +145,7 @@ def _identified(file: BinaryIO, path: Path) -> "Image":
     allowed = (*_FORMATS, "HEIF") if admit(file.read(HEAD), path) else _FORMATS
     file.seek(0)
     formats = [name for name in allowed if name in Image.OPEN]
-    with _LOCK:  # Pillow's limit is a global, and photos are decoded in several threads.
+    with _LOCK:  # Pillow's limit is a global variable, and photos are decoded in several threads.
         bound, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
         try:
             return Image.open(file, formats=formats)

@@ -35,8 +35,8 @@ _IN_A_CELL, _CELLS = 6, 64
 FLAT: Final = 4.0
 Booleans: TypeAlias = NDArray[np.bool_]
 Photo: TypeAlias = tuple[NDArray[np.uint8], Booleans | None]
-#: Function that decodes the photo of a view: [H, W, 3] uint8, and [H, W] bool if some pixels are
-#: masked.
+#: Function that decodes the photo of a view. It returns the pixels [H, W, 3] uint8 and, if some
+#: pixels are masked, the mask [H, W] bool.
 Pixels: TypeAlias = Callable[[int], Photo]
 
 

@@ -7,8 +7,8 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.int64]
 
-#: Two directions count as exactly opposite if 1 + cos is at most this value. Otherwise, a
-#: projection would leave rounding noise, which a scale-free optimizer would follow.
+#: Two directions count as exactly opposite if 1 + cos is at most this value. A projection of such
+#: directions would leave rounding noise, which a scale-free optimizer would follow.
 OPPOSITE = 1e-12
 #: A combination is zero if its square is at most this share of the square of its longest summand.
 #: For two opposite directions this equals `OPPOSITE`.

@@ -37,7 +37,7 @@ from crossgrad_operators.numba_kernels.digits import (
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.int64]
 
-#: Maximum number of proximal steps, each from the previous result.
+#: Maximum number of proximal steps. Each step starts from the previous result.
 ROUNDS = 3
 #: If a pivot (the square of a sine) is at most this value, 16 digits may be inaccurate.
 ILL_CONDITIONED = 1e-6

@@ -28,7 +28,8 @@ _SHARE: Final = {"cpu_cores": "number of cores", "torch_threads": "number of thr
 _SAME_SPEED: Final = {"rate": 0.1, "cpu_rate": 0.25}
 #: A machine counts as busy if its mean load exceeds its number of cores by this amount.
 _BUSY: Final = 0.5
-#: How notes call wall-clock seconds. CPU seconds can be compared even if wall-clock seconds cannot.
+#: Name of wall-clock seconds in notes. CPU seconds can be compared even if wall-clock seconds
+#: cannot.
 _CLOCK: Final = "wall-clock seconds"
 _NEVER_RECORDED: Final = "no run recorded them"
 

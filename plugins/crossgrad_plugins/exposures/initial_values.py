@@ -32,7 +32,8 @@ _SAME = 2
 #: all other photos.
 _NEAREST = 1e-3
 _Floats: TypeAlias = NDArray[np.float64]
-# Cached, because a run requests each held-out photo at every evaluation, and scenes do not change.
+# The results are cached, because a run requests each held-out photo at every evaluation, and scenes
+# do not change.
 _KNOWN: "WeakKeyDictionary[Scene, Neighbours]" = WeakKeyDictionary()
 
 

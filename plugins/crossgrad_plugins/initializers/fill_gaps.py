@@ -59,7 +59,7 @@ class _Filling:
         self.colors.append(colors)
 
 
-#: Cache of the results per scene; they are deleted together with the scene.
+#: Cache of the results of each scene. The results are deleted together with the scene.
 _KNOWN: "WeakKeyDictionary[Scene, dict[Filled, _Filling]]" = WeakKeyDictionary()
 
 

@@ -26,7 +26,7 @@ from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
 _ASKEW: Final = 0.5
 _FEWEST: Final = 3
 _GREY: Final = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601
-#: Cache of the results per scene; they are deleted together with the scene.
+#: Cache of the results of each scene. The results are deleted together with the scene.
 _KNOWN: "WeakKeyDictionary[Scene, dict[Triangulated, MorePoints]]" = WeakKeyDictionary()
 #: Lowe's ratio of the distance to the nearest descriptor to the distance to the second nearest
 #: (SIFT, section 7.1).

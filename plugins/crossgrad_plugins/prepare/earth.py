@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 #: Half a turn in degrees of longitude.
 _HALF = 180.0
-#: Camera axes (x right, y down) that point to the top of a photo, by EXIF orientation.
+#: EXIF orientation -> camera axis (x right, y down) that points to the top of the photo.
 _TOPS: Final = {3: (0.0, 1.0, 0.0), 4: (0.0, 1.0, 0.0), 5: (-1.0, 0.0, 0.0), 6: (-1.0, 0.0, 0.0),
                 7: (1.0, 0.0, 0.0), 8: (1.0, 0.0, 0.0)}  # fmt: skip
 _TOP: Final = (0.0, -1.0, 0.0)

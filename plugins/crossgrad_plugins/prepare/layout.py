@@ -15,7 +15,7 @@ from crossgrad_core.commands import (
 )
 from crossgrad_plugins.prepare.pycolmap_calls import is_whole
 
-#: The folder of intermediate files, and the file that shows that `prepare` made it.
+#: The folder of intermediate files, and the file that shows that `prepare` made this folder.
 WORK: Final = "prepare"
 PLAN: Final = "plan.json"
 

@@ -31,7 +31,8 @@ POSE_COLUMNS: Final = ("x", "y", "alt", "heading", "pitch", "roll")
 COLUMNS: Final = frozenset({NAME_COLUMN, *POSE_COLUMNS, "f"})
 #: If a file has at least this many of the columns, it is probably meant as a RealityCapture CSV.
 _NEARLY: Final = 5
-#: Names in UC-GS scenes: the prefix of a folder of held-out photos, and the word in photo names.
+#: Names in UC-GS scenes: the prefix of a folder of held-out photos, and the word in the names of
+#: held-out photos.
 _TEST: Final = "test"
 _EVAL: Final = re.compile(r"(?<![a-z])eval(?![a-z])")
 #: Maximum number of photo names that are read to recognise a UC-GS scene.

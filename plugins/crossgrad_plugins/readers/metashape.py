@@ -248,7 +248,7 @@ def _sensor(element: Element, file: Path, place: str) -> Calibration:
     if _is_rolling(element):
         what = f"a camera with a rolling shutter ({element.get('label') or 'without a label'})"
         raise refuse_lens(what, fields.where("rolling_shutter"), _GLOBAL)
-    # In the XML, an adjusted calibration follows the initial calibration.
+    # In the XML file, an adjusted calibration follows the initial calibration.
     calibrations = element.findall("calibration")
     adjusted = [
         calibration for calibration in calibrations if calibration.get("class") == "adjusted"

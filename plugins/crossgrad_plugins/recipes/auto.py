@@ -126,7 +126,7 @@ class Choice:
         given: Literal["unbounded", "budget"] | None = self.given.get("growth")
         if given is not None:
             return given
-        # If the user sets a limit, growth does not use the limit as a target.
+        # If the user sets `max_gaussians`, growth does not use it as a target.
         named = self.given["max_gaussians"] not in {None, "auto"}
         led = budgeted and self.facts.unit == "views"
         return "budget" if led and not named else "unbounded"

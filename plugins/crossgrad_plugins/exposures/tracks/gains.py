@@ -37,7 +37,8 @@ _ENOUGH = 5
 #: Maximum number of photos for the decision. If there are more, groups of consecutive photos are
 #: used, because consecutive photos show the same points.
 MOST_DECIDING, _CONSECUTIVE = 128, 8
-# Cached, because a run requests the gains several times and a scene does not change.
+# The results are cached, because a run requests the gains several times and a scene does not
+# change.
 _OF_TRAINING: "WeakKeyDictionary[Scene, TrackGains]" = WeakKeyDictionary()
 _DECIDING: "WeakKeyDictionary[Scene, TrackGains]" = WeakKeyDictionary()
 #: Huber's constant in standard deviations. It gives an efficiency of 95 % for normal errors.
@@ -54,8 +55,8 @@ _FEW, _SHORT = 64, 64
 _TOLERANCE = 1e-5
 #: Standard errors are computed for at most this number of photos, because they need a dense matrix.
 _DENSE = 512
-#: Eigenvalues below this share of the largest eigenvalue count as 0. They belong to the mean of a
-#: connected part, which is not determined.
+#: Eigenvalues below this share of the largest eigenvalue count as 0. They belong to the mean gain
+#: of a connected group of photos, which the observations do not determine.
 _RANK = 1e-9
 #: Residuals below this value, in stops, are rounding errors of 8-bit values.
 _SMALLEST = 1e-3

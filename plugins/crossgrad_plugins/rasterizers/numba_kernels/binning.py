@@ -57,7 +57,7 @@ _GROUP = 32
 #: Start positions of the values of the ellipses in the buffer of a group.
 _OF_SLOPE, _OF_DECAY, _OF_WIDTH, _OF_BUDGET, _OF_EXTENT, _OF_TILT = range(0, 6 * _GROUP, _GROUP)
 
-#: Distance of memory prefetches, in records: first for the slot numbers, then for the slots.
+#: Memory is prefetched this many records ahead: first for the slot numbers, then for the slots.
 _FAR, _NEAR = 32, 16
 
 #: Data of a record that are needed to fill the lists.

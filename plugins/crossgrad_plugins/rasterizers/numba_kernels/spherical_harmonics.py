@@ -34,7 +34,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 #: Number of floats in a cache line.
 _LINE = 16
 #: Number of Gaussians whose basis functions are computed before the first function is used.
-#: Coefficients are prefetched for this number of Gaussians in advance.
+#: Coefficients are also prefetched this many Gaussians ahead.
 _BLOCK = WIDE
 
 

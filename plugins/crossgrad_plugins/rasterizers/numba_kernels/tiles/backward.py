@@ -99,8 +99,8 @@ from crossgrad_plugins.rasterizers.numba_kernels.tiles.pixel_states import (
     start_tile,
 )
 
-#: Values of a patch, WIDE numbers each: alpha, which the gradient with respect to the exponent
-#: replaces later, and the odds of alpha.
+#: Values of a patch, WIDE numbers each: alpha and the odds of alpha. Later, the gradient with
+#: respect to the exponent replaces alpha.
 _ALPHA, _ODDS = 0, WIDE
 _RESPONSE = 2 * WIDE
 

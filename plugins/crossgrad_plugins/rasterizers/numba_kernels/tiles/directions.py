@@ -101,7 +101,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.tiles.pixel_states import (
 BINS, FIELDS = 6, 5
 #: Number of sums per entry: the sums of the bins, and two sums that are not used.
 SUMS = 4 * LANES
-#: Distance of record prefetches, in entries.
+#: Records are prefetched this many entries ahead.
 _AHEAD = 8
 _SMALL, _UP = np.float32(2.0**-60), np.float32(2.0**90)
 _LARGE, _DOWN = np.float32(2.0**60), np.float32(2.0**-66)

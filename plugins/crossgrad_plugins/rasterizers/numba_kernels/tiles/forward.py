@@ -77,12 +77,13 @@ from crossgrad_plugins.rasterizers.numba_kernels.tiles.pixel_states import (
     row_of,
 )
 
-#: Number of entries whose reach is computed before any of them is blended. The other entries hide
-#: the latency of memory reads and of the row extents. Finished patches are detected once per batch.
+#: Number of entries whose reach is computed before any of them is blended. Processing the entries
+#: in batches hides the latency of memory reads and of the row extents. Finished patches are
+#: detected once per batch.
 BATCH = 16
 
-# Side in pixels of the squares in which limits are counted, and a bit mask of the patches in the
-# first column of squares.
+# Side in pixels of the squares that `limits` counts, and a bit mask of the patches in the first
+# column of squares.
 _SQUARE = int(SQUARE)
 _ABREAST = np.uint64(
     sum(1 << patch for patch in range(PATCHES) if patch % COLUMNS < _SQUARE // SIDE)

@@ -62,7 +62,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.tiles.pixel_states import (
     row_of,
 )
 
-#: Distance of record prefetches, in entries.
+#: Records are prefetched this many entries ahead.
 _AHEAD = 8
 
 
