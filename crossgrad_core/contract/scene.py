@@ -137,7 +137,7 @@ def check_coordinates(name: str) -> None:
 
 #: Minimum number of cameras for a search for stray cameras.
 _FEWEST: Final = 5
-#: Largest share of stray cameras; a single stray camera is always possible.
+#: Largest share of stray cameras. A single stray camera is always possible.
 _MOST: Final = 0.1
 #: A camera is stray if its distance from the middle is more than this many times the distance of
 #: all other cameras and of the points.
@@ -386,7 +386,7 @@ _FEWEST_SEEN = 3
 #: Maximum number of points that are tested against the image of a view that observed too few
 #: points.
 _MOST_TESTED = 50_000
-#: Significant bits of a length between cameras; further bits are rounding errors.
+#: Number of significant bits of a length between cameras. Further bits are rounding errors.
 _BITS = 40
 #: Relative error of an input coordinate from its rounding and the rounding of a few sums.
 _ROUNDED = 16 * float(np.finfo(np.float64).eps)

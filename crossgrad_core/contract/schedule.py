@@ -138,7 +138,7 @@ SHORTEST_INTERVAL = 100
 #: interval. It is half the published interval, because short runs grow too few anchors
 #: (docs/benchmarks.md).
 SHORTEST_ANCHOR_INTERVAL = 50
-#: Shorter runs make no opacity reset, because they are too short to recover from it.
+#: Runs shorter than this make no opacity reset, because they are too short to recover from it.
 SHORTEST_RUN_WITH_RESET = 10_000
 #: If edits are counted in views, an interval is one pass over the training photos. The interval is
 #: shorter if the run would otherwise make fewer edits than this number.

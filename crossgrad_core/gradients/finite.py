@@ -12,7 +12,7 @@ from crossgrad_core.gradients.columns import is_native
 from crossgrad_core.gradients.sparse_rows import values_of
 
 _INFINITY: Final = int(np.float32(np.inf).view(np.uint32))
-#: Up to this many parts are processed by one thread.
+#: At most this many parts are processed by one thread.
 _FEW: Final = 8
 
 

@@ -19,12 +19,12 @@ def sparse_rows(rows: Tensor, values: Tensor, shape: Sequence[int]) -> Tensor:
 
 def rows_of(gradient: Tensor) -> Tensor:
     """Return [R] int64 rows of a sparse gradient."""
-    return gradient._indices()[0]  # noqa: SLF001 - the public name wants a flag that autograd drops
+    return gradient._indices()[0]  # noqa: SLF001 - the public function needs a flag that autograd drops
 
 
 def values_of(gradient: Tensor) -> Tensor:
     """Return [R, ...] values of a sparse gradient."""
-    return gradient._values()  # noqa: SLF001 - as above
+    return gradient._values()  # noqa: SLF001 - see above
 
 
 def coalesced(gradient: Tensor | None) -> Tensor | None:

@@ -20,7 +20,7 @@ _FLAGS = {"contract", "nsz"}
 def compiled(function: Callable[P, R], **options: Any) -> Callable[P, R]:  # noqa: ANN401
     """Compile an entry point with options of Numba's `njit`; cached on disk."""
     dispatcher = _COMPILE(**_OPTIONS, **options)(function)
-    dispatcher._cache = cache_for(function)  # noqa: SLF001 (Numba has no public way)
+    dispatcher._cache = cache_for(function)  # noqa: SLF001 - Numba has no public function for this
     return cast("Callable[P, R]", dispatcher)
 
 

@@ -19,7 +19,7 @@ caches.
 The result of a job must not depend on the thread that runs it. Then the threads do not affect any
 bit.
 """
-# ruff: noqa: ANN401, ARG001 - Numba's objects have no types, and it fixes the arguments.
+# ruff: noqa: ANN401, ARG001 - Numba's objects have no types, and Numba defines the arguments.
 
 import atexit
 import os

@@ -12,7 +12,7 @@ the same expression in two kernels gives the same bits.
 Functions exist only inside compiled kernels; `Lanes` and `Mask` are annotations. A kernel that
 needs other lane operations can define them with `emitted` and the helpers of this module.
 """
-# ruff: noqa: ANN401, ARG005 - Numba's objects have no types, and it fixes the arguments.
+# ruff: noqa: ANN401, ARG005 - Numba's objects have no types, and Numba defines the arguments.
 
 import operator
 from collections.abc import Callable, Sequence
@@ -30,7 +30,7 @@ LANES = 8
 WIDE = 2 * LANES
 
 _FLOAT, _BYTE, _INT, _LONG = ir.FloatType(), ir.IntType(8), ir.IntType(32), ir.IntType(64)
-_ALIGNMENT = 4  # bytes; float32 arrays guarantee no larger alignment
+_ALIGNMENT = 4  # In bytes. Float32 arrays guarantee no larger alignment
 _SIGN_BIT, _MANTISSA_BITS = -(2**31), 23
 
 
@@ -64,7 +64,7 @@ class _MaskType(types.Type):
         cast("Any", super()).__init__(name=f"Mask{width}")
 
 
-#: Types of vectors; they are called with a width.
+#: Types of vectors. To get a type, call them with a width.
 _lanes, _mask = _LanesType, _MaskType
 
 
@@ -147,7 +147,7 @@ def _define(sign: Callable[[Any, Any], Any], emit: Callable[..., Any], kind: Any
     """Define a Python operator for two values of one kind."""
     implementation = emitted(emit, to, kind, kind)
 
-    @overload(sign, strict=False)  # the annotations are not part of the signature
+    @overload(sign, strict=False)  # The annotations are not part of the signature
     def _overloaded(a: Any, b: Any) -> Any:
         if isinstance(a, kind) and a == b:
             return lambda a, b: implementation(a, b)  # noqa: PLW0108 - Numba compiles the lambda

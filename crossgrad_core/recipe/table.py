@@ -31,7 +31,7 @@ DECIDED: Final = (
 #: First part of the names of rows for rules. The row `rules.NAME` contains the options of the rule,
 #: or False if the rule is not used.
 RULES: Final = "rules"
-#: Largest number of decision lines in the terminal.
+#: Maximum number of decision lines in the terminal.
 LINES: Final = 12
 
 

@@ -209,7 +209,7 @@ def failed_plugin(error: Exception) -> UserError | None:
     raising = [(entry, line) for entry in others if (line := raised_at(error, entry.package))]
     if not raising:
         return None
-    # If two distributions share a package, prefer the one that contains the module.
+    # If two distributions share a package, prefer the distribution that contains the module.
     entry, line = next((one for one in raising if one[1].startswith(f"{one[0].file}:")), raising[0])
     return UserError(
         f"a plugin of package {entry.distribution} {entry.version} raised an error",

@@ -129,7 +129,7 @@ def bundled_scene() -> Path:
 
 
 _LOG = logging.getLogger(__name__)
-#: Exit code of a failed run; its results so far are kept.
+#: Exit code of a failed run. The results that the run wrote before the failure are kept.
 FAILED = 1
 
 

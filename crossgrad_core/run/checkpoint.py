@@ -163,7 +163,7 @@ def _clear(folder: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
 
 
-#: Version of the layout; increased if an older reader could misread a newer checkpoint.
+#: Version of the layout. It is raised if an older reader could misread a newer checkpoint.
 FORMAT = 1
 _DIGEST = "state_sha256"
 

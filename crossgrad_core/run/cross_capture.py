@@ -26,7 +26,8 @@ LEAST_SHARED, MARGIN = 0.1, 1.1
 #: run's points is at most this share of the median after any of `TURNS` random rotations about the
 #: middle of the capture.
 LEAST_ALIKE, TURNS = 0.4, 9
-#: Numbers of points for this test: minimum, maximum from the other capture, maximum from the run.
+#: Minimum number of points for this test, maximum number of points from the other capture, and
+#: maximum number of points from the run.
 FEWEST_POINTS, MOST_POINTS, MOST_OWN = 200, 2_000, 50_000
 
 

@@ -311,7 +311,8 @@ def _kept(course: RunLoop) -> list[str]:
     return [f"the state of step {step} could not be saved; {there}"]
 
 
-#: Steps and training seconds to observe before the estimate; the very first step is left out.
+#: Number of steps and number of training seconds to observe before the estimate. The very first
+#: step is left out.
 LOOK_STEPS, LOOK_SECONDS = 3, 2.0
 #: No estimate is shown if less time than this remains, in seconds.
 WORTH_A_LINE = 60.0

@@ -530,7 +530,7 @@ def _config(folder: Path, settings: Mapping[str, Any]) -> RunConfig:
         )
     stored = read_config(folder)
     stored.pop("stop_after", None)
-    # Runs write the initial degree; runs of the first versions started with degree 0.
+    # Runs write the initial degree. Runs of the first versions started with degree 0.
     stored["sh_from"] = stored.get("sh_from") or 0
     try:
         config = parsed({**stored, **settings})

@@ -89,7 +89,8 @@ class Calibration:
                 found=str(len(self.params)),
                 todo=_AGAIN,
             )
-        if not all(abs(value) <= _LARGEST_PARAMETER for value in self.params):  # also False for NaN
+        # This is also False for NaN.
+        if not all(abs(value) <= _LARGEST_PARAMETER for value in self.params):
             raise UserError(
                 "a camera parameter is not a finite number",
                 where=where,

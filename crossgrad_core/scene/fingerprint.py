@@ -21,11 +21,12 @@ from crossgrad_core.scene.photos.photos import FilePhoto
 from crossgrad_core.scene.split import TEST_LIST, TRAIN_LIST
 from crossgrad_core.scene.wording import name_some
 
-#: Version of the layout; raised whenever an older reader could misread a newer fingerprint.
+#: Version of the layout. It is raised if an older reader could misread a newer fingerprint.
 FORMAT: Final = 1
-#: Bytes of a file that are read at its start and at its end.
+#: Number of bytes of a file that are read at its start and at its end.
 END = 64 * 2**10
-#: Decimals stored for pixels and local units: far more than needed to distinguish cameras.
+#: Number of decimals that are stored for pixels and local units. They are far more than needed to
+#: distinguish cameras.
 DECIMALS = 6
 # Libraries on another machine may round the last digits differently.
 _TOLERANCE = 10.0 ** (1 - DECIMALS)
@@ -193,7 +194,7 @@ def _points_of(scene: Scene) -> PointsMark:
 class Weight(IntEnum):
     """The effect of a difference on a model that was trained on the former scene."""
 
-    #: Only pixels or points differ; all cameras and parameters are unchanged.
+    #: Only pixels or points differ. All cameras and parameters are unchanged.
     CONTENT = 1
     #: Other views are held out than before.
     HELD_OUT = 2

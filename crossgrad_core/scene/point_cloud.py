@@ -37,7 +37,7 @@ _COLORS: Final = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "di
 _GAUSSIAN: Final = frozenset({"f_dc_0", "opacity", "scale_0", "rot_0"})
 _RGB: Final = ("red", "green", "blue")
 _AT_ONCE: Final = 1_000_000
-#: Maximum number of points that are read from a file; from a larger file, only every n-th point is
+#: Maximum number of points that are read from a file. From a larger file, only every n-th point is
 #: read.
 _MOST_IN_LAS: Final = 20_000_000
 #: Number of points that are kept by default: FEWEST, or PER_PHOTO for each photo if that is more.

@@ -19,7 +19,7 @@ TEST_LIST = "test_list.txt"
 #: median of the training views is the threshold.
 Label: TypeAlias = Callable[[Sequence[str]], Mapping[str, str]]
 
-_LINES: Final = {b"\n": 150}  # bytes of a name in memory
+_LINES: Final = {b"\n": 150}  # number of bytes of a name in memory
 
 #: A mean over fewer held-out views than this does not describe a regime.
 _FEWEST: Final = 2

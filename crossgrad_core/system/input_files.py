@@ -16,7 +16,7 @@ from crossgrad_core.system.files import size_text
 #: times as much memory.
 LARGEST: Final = 64 << 20
 GROWS: Final = 8
-#: Bytes per character of Python's widest strings.
+#: Number of bytes per character of Python's widest strings.
 _WIDEST: Final = 4
 
 

@@ -17,7 +17,7 @@ SIGNALS = tuple(
 )
 #: Lines that tell the user how to continue after an immediate end. The newest line is last.
 _WAYS_ON: list[str] = []
-#: Files that are being written; they are deleted if the process ends immediately.
+#: Files that are being written. They are deleted if the process ends immediately.
 UNFINISHED: set[str] = set()
 #: Numbers of the processes that write unfinished files. These processes are ended first.
 HELPERS: set[int] = set()

@@ -29,10 +29,11 @@ from crossgrad_core.wording import listed
 
 #: Steps at which decoding is checked: before the first step, early, and at the end.
 _STEPS = (0, 1, 30_000)
-#: Largest change of parameters from their initial values.
+#: Maximum change of parameters from their initial values.
 _STEP = 0.02
-#: Largest and mean difference of two renders whose float32 values were computed in two ways. A few
-#: Gaussians then appear in or disappear from a pixel at their edge, where alpha is 1/255.
+#: Maximum difference and mean difference of two renders whose float32 values were computed in
+#: different ways. A few Gaussians then appear in or disappear from a pixel at their edge, where
+#: alpha is 1/255.
 _PIXEL, _MEAN = 0.02, 2e-4
 
 

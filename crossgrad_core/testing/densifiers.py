@@ -163,7 +163,7 @@ def _directions(radii: Tensor, gradient: Tensor, rng: np.random.Generator) -> Te
     """Make up to four pixels in each bin; their absolute gradients sum to twice `gradient`."""
     shape = (radii.shape[0], 6, 4)
     angles = torch.from_numpy(rng.uniform(0.0, 2.0 * np.pi, shape)).float()
-    there = torch.from_numpy(rng.random(shape) < 0.5).float()  # noqa: PLR2004 - every other one
+    there = torch.from_numpy(rng.random(shape) < 0.5).float()  # noqa: PLR2004 - each value is 1 with probability one half
     there *= (radii > 0)[:, None, None]
     units = torch.stack([angles.cos(), angles.sin(), there], -1) * there[..., None]
     sums = units.sum(2)
@@ -174,7 +174,8 @@ def _directions(radii: Tensor, gradient: Tensor, rng: np.random.Generator) -> Te
 def _backbone_for(densifier: Densifier) -> Backbone:
     """Return a backbone that uses this densifier by default, or that has the tensors it edits."""
     fitting = []
-    # If several backbones are suitable, use the first one. Crossgrad's own backbones come first.
+    # If several backbones are suitable, use the first backbone. Crossgrad's own backbones come
+    # first.
     candidates = sorted(
         entries("backbones").values(), key=lambda entry: entry.distribution != "crossgrad"
     )

@@ -74,7 +74,7 @@ from crossgrad_core.testing.support.renders import (
 )
 from crossgrad_core.wording import in_one_line
 
-#: The hooks of one run's manager; pluggy gives them no types.
+#: The hooks of one run's manager. pluggy gives them no types.
 Hooks: TypeAlias = Any
 
 _VIEWS = (0, 4)
@@ -95,7 +95,8 @@ _ON_THE_CLOCK = {
 #: Number of calls, and time limit for the fastest call. The fastest call counts, because a busy
 #: machine slows only some calls.
 _CALLS, _SLOW = 6, 0.1
-#: Bytes that an observer may keep per step, and steps between two measurements of the memory.
+#: Number of bytes that an observer may keep per step, and number of steps between two measurements
+#: of the memory.
 _KEPT, _BLOCK = 100_000, 4
 
 

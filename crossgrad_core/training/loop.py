@@ -188,7 +188,7 @@ Ending = Literal["finished", "stopped", "paused"]
 #: A bad parameter that affects neither the loss nor the gradients, for example of a Gaussian that
 #: is no longer rendered, is found later.
 CHECK_EVERY = 10
-#: Number of steps between copies of the last good state; a multiple of `CHECK_EVERY`.
+#: Number of steps between copies of the last good state. It is a multiple of `CHECK_EVERY`.
 SNAPSHOT_EVERY = 100
 
 

@@ -26,7 +26,7 @@ from crossgrad_core.wording import listed
 
 #: Name of the file in a run's folder.
 PHOTO_VALUES: Final = "exposure.json"
-#: Version of the format; increased when an older reader could misread a newer file.
+#: Version of the format. It is raised if an older reader could misread a newer file.
 PHOTO_VALUES_FORMAT: Final = 1
 _TODO = "give the exposure.json of a run, or leave --exposure-from out"
 

@@ -153,8 +153,8 @@ def observed_views(
     return (*records, observe_view(setup, state, draw, scales_of(setup, state, draw)[0]))
 
 
-#: Minimum number of Gaussians that are sorted; with 59 parameters each, parameters and moments use
-#: 12 MB.
+#: Minimum number of Gaussians that are sorted. With 59 parameters per Gaussian, the parameters and
+#: moments use 12 MB.
 FEWEST_SORTED = 2**14
 #: Number of bits of a coordinate in a code of 63 bits, and number of cells per unit of the local
 #: frame. The cameras span about one unit. Positions farther away than 128 units are clamped to the

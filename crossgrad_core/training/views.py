@@ -573,7 +573,7 @@ def _regularize_view(setup: Setup, state: TrainState, drawn: _Drawn, into: Tenso
 
 
 def _backward(loss: Tensor) -> None:
-    # A view without visible Gaussians has a constant image and no gradients; this is not an error.
+    # A view without visible Gaussians has a constant image and no gradients. This is not an error.
     if loss.requires_grad:
         loss.backward()  # type: ignore[no-untyped-call]
 

@@ -152,7 +152,7 @@ def _filled(given: Gradients, kept: Kept) -> list[NDArray[Any]]:
     ]
 
 
-#: Names of the outputs of `forward`; the first five are differentiable.
+#: Names of the outputs of `forward`. The first five outputs are differentiable.
 _OUTPUTS = ("means", "quats", "scales", "opacities", "colors", "origin", "slot")
 _DIFFERENTIABLE = 5
 

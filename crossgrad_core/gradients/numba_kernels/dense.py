@@ -23,9 +23,10 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Rows = NDArray[np.float32]
 
-#: Elements of one chunk, 64 kB per view: a chunk of sixteen views fits into the L2 cache.
+#: Number of elements of one chunk, which has 64 kB per view. A chunk of sixteen views fits into the
+#: L2 cache.
 CHUNK = 16384
-#: Elements of a chunk that a weighted sum processes at a time.
+#: Number of elements of a chunk that a weighted sum processes at a time.
 PIECE = 1024
 
 

@@ -8,7 +8,7 @@ from crossgrad_core.gradients.numba_kernels.pointers import float32_pointer
 from crossgrad_core.numerics.jit import kernel
 from crossgrad_core.numerics.jobs import Jobs, next_job
 
-#: Elements that a thread processes at a time.
+#: Number of elements that a thread processes at a time.
 PART = 2**15
 _ALL_BUT_SIGN = np.uint32(0x7FFFFFFF)
 

@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 FILE = "curve.png"
 _OVERALL = "overall"
 
-#: Okabe and Ito's colours, distinguishable with any colour vision; black is kept for `overall`.
+#: Okabe and Ito's colours, distinguishable with any colour vision. Black is kept for `overall`.
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _MARKERS = ("s", "^", "D", "v", "P", "X")
 _STYLES = ("--", "-.", ":")
 #: With more points than this, markers would hide the line.
 _MOST_MARKERS = 25
-_LONGEST_IN_TWO_COLUMNS = 48  # characters of a legend entry
+_LONGEST_IN_TWO_COLUMNS = 48  # in characters of a legend entry
 
 
 class _Line(NamedTuple):

@@ -19,7 +19,7 @@ from crossgrad_core.system.files import (
     is_leftover,
 )
 
-#: Space that a run with a small scene and few renders may take, in bytes.
+#: Number of bytes that a run with a small scene and few renders may write.
 SMALLEST_NEED = 64 * 2**20
 #: Folder that contains all runs, relative to the working folder.
 RUNS = Path("runs")

@@ -18,8 +18,8 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.system.check_writable import check_own
 from crossgrad_core.system.files import disk_errors
 
-#: Name of the locked file. The file remains when its process has ended; then no process holds the
-#: lock.
+#: Name of the locked file. The file remains when its process has ended, but then no process holds
+#: the lock.
 FILE = "run.lock"
 
 _TAKEN = frozenset({errno.EAGAIN, errno.EACCES, errno.EWOULDBLOCK, errno.EDEADLK})

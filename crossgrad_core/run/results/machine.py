@@ -22,7 +22,8 @@ CALIBRATION_SECONDS = 2.0
 #: Runs that trained for fewer seconds are not calibrated, because calibration would take too long
 #: for them.
 WORTH_A_CALIBRATION = 20.0
-#: Numbers in the fixed workload, and passes over them between two readings of the clock.
+#: Number of values in the fixed workload, and number of passes over the values between two readings
+#: of the clock.
 _NUMBERS, _PASSES = 1 << 16, 8
 
 

@@ -197,7 +197,7 @@ def _unreadable(path: Path, found: str) -> UserError:
     )
 
 
-#: Errors of at least this size get the last colour; the limit is fixed, so that panels are
+#: Errors of at least this size get the last colour. The limit is fixed, so that panels are
 #: comparable.
 LARGEST_ERROR = 0.25
 _COLORMAP = "inferno"
@@ -312,7 +312,7 @@ def _font(size: int, *, bold: bool = False) -> "FreeTypeFont":
 
 def _label(draw: "ImageDraw", layout: Layout, metrics: ViewMetrics, step: int) -> None:
     bold, font = _font(layout.font, bold=True), _font(layout.font)
-    line = layout.margin + layout.font  # base line of the title
+    line = layout.margin + layout.font  # baseline of the title
     draw.text((layout.margin, line), metrics.name, fill=_INK, font=bold, anchor="ls")
     after = layout.margin + draw.textlength(metrics.name, font=bold) + layout.font
     text = f"{metrics.regime}, step {step:,}"

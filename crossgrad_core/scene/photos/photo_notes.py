@@ -26,7 +26,7 @@ Sources = Mapping[str, PhotoSource]
 #: or by `prepare`.
 _OWN_FOLDERS: Final = frozenset({"config.yaml", "plan.json"})
 _OWN_FILES: Final = frozenset({"report.png"})
-#: Largest number of groups of unused files with a separate note.
+#: Maximum number of groups of unused files with a separate note.
 _MOST: Final = 8
 
 

@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 _LOG = logging.getLogger(__name__)
-#: Environment variable for the folder of all entries; the default is in the user's cache folder.
+#: Environment variable for the folder of all entries. The default is in the user's cache folder.
 FOLDER: Final = "CROSSGRAD_CACHE"
 #: Raised whenever decoding, undistorting or resizing gives other bits than before.
 PIXELS_VERSION: Final = 2

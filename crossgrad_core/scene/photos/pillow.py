@@ -31,7 +31,7 @@ _LOCK = Lock()
 _DEEP = re.compile("RGBA?;16[BLN]")
 #: Suffixes of HEIC and HEIF files.
 SUFFIXES = (".heic", ".heif", ".hif")
-#: Bytes at the start of a file that identify HEIC and HEIF.
+#: Number of bytes at the start of a file that identify a HEIC or HEIF file.
 HEAD = 12
 _BRANDS = frozenset(
     {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"hevm", b"hevs", b"mif1", b"msf1"}

@@ -15,7 +15,7 @@ from torch import Tensor
 from crossgrad_core.gradients.columns import is_native
 from crossgrad_core.numerics.rotations import rotation_matrices
 
-#: Largest ratio, in either direction, of an axis length to the typical axis length.
+#: Maximum ratio of an axis length to the typical axis length. The inverse ratio has the same limit.
 LIMIT: Final = 5.0
 #: Largest number of Gaussians that are sampled for the typical length.
 _SAMPLE = 1024

@@ -55,8 +55,9 @@ from crossgrad_operators.numba_kernels.polyhedron import (
 
 #: Maximum number of levels that are tried. About five are usual.
 LEVELS = 60
-#: A level is accepted in two cases, if the active constraints do not change: its change is at most
-#: this share, or its change has the opposite sign. The next rounds correct the remaining error.
+#: A level is accepted if the active constraints do not change and its change is small or reversed.
+#: A change is small if it is at most this share of the level. The next rounds correct the remaining
+#: error.
 CLOSE = 1e-6
 #: If the ridge adds more than this share of rho^2 to the distance, the directions may cancel.
 HELD_BY_RIDGE = 1e-5

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 _WIDTH = 80
 _MARGIN = "  "
-#: Sections of docstrings that are not for users; options and their bounds are listed separately.
+#: Sections of docstrings that are not for users. Options and their bounds are listed separately.
 _SECTIONS = ("Attributes:", "Args:", "Returns:", "Raises:")
 _SIGNS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<", "multiple_of": "a multiple of"}
 _LENGTHS = {"min_length": "at least", "max_length": "at most"}

@@ -107,7 +107,7 @@ def _unlike_pairs(arms: Mapping[str, Runs]) -> Iterator[tuple[Run, Run]]:
 
 
 _TEMPLATE: Final = Path(__file__).with_name("page.html")
-#: Number of table rows that are visible; a click shows further rows.
+#: Number of table rows that are visible. A click shows further rows.
 _OPEN_ROWS: Final = 12
 #: Series colours on a dark page: the same hues, lighter.
 _DARK: Final = ("#4fa8e0", "#f08a3c", "#2fc79b", "#e3a1c5", "#f0b93a", "#86c9f2", "#c2a04a")

@@ -20,7 +20,8 @@ _SIZES: Final = re.compile(r"^photos: (?P<sizes>\d.*?) from .*?/, (?P<how>.*)$")
 _MOST_SHOWN: Final = 3
 #: Key of the definition that applies to every metric, because it says how renders are compared.
 _RENDERS: Final = "renders"
-#: The environment fields that identify a machine; `_SHARE` says how the machine is used.
+#: The environment fields that identify a machine. The fields in `_SHARE` describe how much of the
+#: machine is used.
 _MACHINE: Final = {"cpu": "processor", "gpu": "GPU", "device": "device"}
 _SHARE: Final = {"cpu_cores": "number of cores", "torch_threads": "number of threads"}
 #: Allowed relative difference of the calibration rates: by wall clock, and in CPU time. CPU time

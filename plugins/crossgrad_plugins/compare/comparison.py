@@ -138,7 +138,7 @@ class Comparison:
         """The contrasts of the main pairs, overall and by regime, on scenes with agreed regimes."""
         regime_lists = (run.results.regimes for run in self.runs if run.scene not in self.unlike)
         names = sorted({regime for regimes in regime_lists for regime in regimes})
-        if len(names) < 2:  # noqa: PLR2004 - a single one would repeat `overall`
+        if len(names) < 2:  # noqa: PLR2004 - a single regime would repeat `overall`
             return ()
         return pairwise.judged(
             self._at_end(couple, self.quantity, regime or OVERALL, regime, self.unlike)

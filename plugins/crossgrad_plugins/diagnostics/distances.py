@@ -8,7 +8,7 @@ from scipy.stats import rankdata
 
 #: Correlations that differ by less than this count as equal.
 _ROUNDING = 1e-9
-#: Number of decimals of a difference of logarithms that are kept; further decimals are rounding
+#: Number of decimals of a difference of logarithms that are kept. Further decimals are rounding
 #: errors.
 _DIGITS = 9
 #: Number of bins of photo pairs. The pairs are binned by the difference of their distances.

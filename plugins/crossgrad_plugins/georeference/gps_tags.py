@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-#: Latitude and longitude in degrees, and altitude in metres; each may be NaN.
+#: Latitude and longitude in degrees, and altitude in metres. Each of the three numbers may be NaN.
 Numbers: TypeAlias = tuple[float, float, float]
 _IFD: Final = 0x8825
 _SOUTH_OR_WEST: Final = {"S", "W"}

@@ -31,8 +31,8 @@ _KNOWN: "WeakKeyDictionary[Scene, dict[Triangulated, MorePoints]]" = WeakKeyDict
 #: Lowe's ratio of the distance to the nearest descriptor to the distance to the second nearest
 #: (SIFT, section 7.1).
 _RATIO: Final = 0.8
-#: Smallest and largest angle between two rays. At smaller angles the intersection is inaccurate; at
-#: larger angles the features show different surfaces.
+#: Smallest and largest angle between two rays. At smaller angles the intersection is inaccurate. At
+#: larger angles, the features show different surfaces.
 _SMALLEST, _LARGEST = np.deg2rad(1.5), np.deg2rad(60.0)
 
 

@@ -50,7 +50,7 @@ class Progress(Observer):
         10.0, gt=0.0, description="seconds between lines if the output is not a terminal"
     )
 
-    # The state of the display; it is not part of the run's state.
+    # The state of the display. It is not part of the run's state.
     _pace: Pace = PrivateAttr(default_factory=lambda: Pace(1))
     _tenth: int = PrivateAttr(default=1)
     _bar: "tqdm[Any] | None" = PrivateAttr(default=None)
@@ -155,5 +155,6 @@ class Progress(Observer):
             sys.stderr.write(text + "\n")
             sys.stderr.flush()
         else:
-            # `tqdm` writes the line above the bar; otherwise the line would break the bar.
+            # `tqdm` writes the line above the bar. Printed in another way, the line would break the
+            # bar.
             self._bar.write(showable(text), file=controls_of(sys.stderr))

@@ -27,7 +27,7 @@ from crossgrad_plugins.planner.planner import Plan, plan_of
 #: evidence.
 _WIDE: Final = 110
 _HEADER: Final = ("part", "decision", "evidence", "cost saved", "force with")
-#: Widths of the columns of a wide table; the evidence gets the remaining width.
+#: Widths of the columns of a wide table. The evidence gets the remaining width.
 _WIDTHS: Final = (14, 20, 0, 18, 23)
 _GAP: Final = "  "
 #: Basis of a choice -> text that is printed after the choice.

@@ -17,7 +17,7 @@ from crossgrad_plugins.groupings.split import log_distances, otsu_separability, 
 LEAST_RATIO: Final = 1.5
 #: Minimum number of views to detect two modes.
 FEWEST: Final = 10
-#: Minimum share of views in the smaller mode; a smaller group is treated as outliers.
+#: Minimum share of views in the smaller mode. A smaller group is treated as outliers.
 LEAST_SHARE: Final = 0.1
 #: About one of this many samples from a uniform distribution separates as well as two modes do.
 ONE_OF: Final = 100

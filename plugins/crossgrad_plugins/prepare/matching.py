@@ -86,7 +86,8 @@ _MOST_LOCATED: Final = 0.9
 #: Number of photos with which each photo is compared: the nearest by GPS, the most similar, and the
 #: next by name.
 _NEAREST, _ALIKE, _NEXT = 40, 40, 5
-#: Number of next photos by name if neither GPS nor similarity determines the neighbours.
+#: Number of following photos, in the order of names, that are neighbours of a photo. It applies if
+#: neither GPS nor similarity determines the neighbours.
 _NEXT_ALONE: Final = 20
 #: Maximum distance in metres between neighbours by GPS. A photo with a wrong GPS position therefore
 #: has no neighbours by GPS.
@@ -96,7 +97,7 @@ _LOOKED_UP: Final = 2000
 #: Maximum number of geometries that are tried for the matches of a pair. For a pair that shares no
 #: content, COLMAP tries five times as many.
 _TRIALS: Final = 2000
-#: Bytes of a pair in the database for each requested feature of a photo.
+#: Number of bytes of a pair in the database for each requested feature of a photo.
 _BYTES_OF_PAIR: Final = 2
 #: Method for choosing photos to compare -> pycolmap's pairing methods.
 _WAYS: Final = {

@@ -72,7 +72,7 @@ def opensfm(path: Path, names: Sequence[str] = OPENSFM_FILES) -> bool:
     return any(begins_with(path / name, b"[") for name in names)
 
 
-def photos_alone(path: Path) -> bool:  # noqa: ARG001 - no folder is prepared unasked
+def photos_alone(path: Path) -> bool:  # noqa: ARG001 - the answer does not depend on the folder
     """Return False: only `--prepare` reads a folder this way."""
     return False
 

@@ -25,8 +25,8 @@ ALL = "all"
 #: Number of scales, from 1 / GRID to 1, at which the kept shares of the spectrum are measured.
 GRID = 256
 #: Largest side in pixels of the window in the middle of a photo that is analysed. In a cropped
-#: photo, a scale keeps the same share of the spectrum as in the whole photo. In a smaller copy, it
-#: does not.
+#: photo, a scale keeps the same share of the spectrum as in the whole photo. In a smaller copy of
+#: the photo, the scale keeps another share.
 _WINDOW = 1024
 #: Number of photos that are decoded at once. More photos would need too much memory.
 _AT_ONCE = 2

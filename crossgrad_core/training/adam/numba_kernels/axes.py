@@ -17,7 +17,7 @@ from crossgrad_core.numerics.simd import (
     where,
 )
 
-#: Rows of one job; fixed, so that results do not depend on the number of threads.
+#: Number of rows of one job. It is fixed, so that results do not depend on the number of threads.
 _ROWS = 1 << 13
 _ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
 #: Squares below this value have too few significant bits.

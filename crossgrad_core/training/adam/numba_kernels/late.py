@@ -146,7 +146,7 @@ def catch_up(
     count = done.size if whole else rows.size
     end = steps.size // NUMBERS
     left = width % LANES
-    # Buffer for the last elements of a row; the unused lanes are zero.
+    # Buffer for the last elements of a row. The unused lanes are zero.
     rest = np.zeros(3 * LANES, np.float32)
     tasks = (count + _ROWS - 1) // _ROWS
     task = next_job(jobs, tasks)

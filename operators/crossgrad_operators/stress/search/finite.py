@@ -64,7 +64,8 @@ def run_finite(
 
 def _batch(subject: Subject, dtype: torch.dtype, count: int, seed: tuple[int, int]) -> Batch:
     rng = np.random.default_rng(seed)
-    # Two successive batches belong to the same family. They have different types.
+    # Two successive batches belong to the same family. The gradients of the two batches have
+    # different types.
     family = list(FAMILIES)[seed[1] // 2 % len(FAMILIES)]
     views = int(rng.integers(2, VIEWS + 1))
     if not subject.operator.views.admits(views):

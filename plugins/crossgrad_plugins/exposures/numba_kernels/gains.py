@@ -136,8 +136,8 @@ def expose_back(
             values, after = load(image, start + lane), load(taken, start + lane)
             given = load(upstream, start + lane)
             before_line, after_line = values <= dark, after <= dark
-            # If the gain moves a value out of the straight part of the curve, the divisor is the
-            # value times the exponent.
+            # If the gain moves a value out of the straight part of the curve, the divisor of the
+            # slope is the value times the exponent.
             below = where(before_line, exponent * values, values + offset)
             above = where(after_line, exponent * after, after + offset)
             slope = where(

@@ -13,7 +13,7 @@ from torch import Tensor
 from crossgrad_core.plugin import Camera, Scene, UserError, View
 from crossgrad_plugins.exposures.srgb import decoded
 
-#: Maximum number of observations; if there are more, only every n-th point is used.
+#: Maximum number of observations. If there are more, only every n-th point is used.
 _MOST = 400_000
 #: Number of photos that are decoded in parallel. More photos would need too much memory.
 _AT_ONCE = 2

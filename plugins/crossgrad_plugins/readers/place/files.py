@@ -31,7 +31,7 @@ _PROJ_UTM: Final = re.compile(
 )
 _SHOWN: Final = 80
 _POSITION: Final = struct.Struct("<3d")
-_LONGEST: Final = 1 << 20  # bytes of a text, a blob or a row
+_LONGEST: Final = 1 << 20  # number of bytes of a text, a blob or a row
 _WGS84: Final = 0  # a value of COLMAP's PosePriorCoordinateSystem
 #: The column of the photo's id: first in COLMAP 4, then in older versions.
 _COLUMNS: Final = ("corr_data_id", "image_id")

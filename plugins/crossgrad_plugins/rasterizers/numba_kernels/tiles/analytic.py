@@ -61,7 +61,7 @@ SIGMA_FLOOR = 1e-3
 #: of two such values is a valid float32 number.
 SIGMA_CEILING = 1e18
 _ROOT_2_PI = math.sqrt(2.0 * math.pi)
-#: F'(x) <= F'(0) exp(-TAIL x^2 / 2) for all x, with F'(0) = LINEAR / 4; a test checks this.
+#: F'(x) <= F'(0) exp(-TAIL x^2 / 2) for all x, with F'(0) = LINEAR / 4. A test checks this.
 TAIL = 0.9975
 
 # Coefficients of (1 - exp(-D)) / D on [0, 1/2], from low to high power. They minimise the maximum
