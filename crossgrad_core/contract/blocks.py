@@ -355,7 +355,7 @@ def apply_to_moment(edit: Edit, name: str, old: Tensor) -> Tensor:
 
 #: Epsilon that is added to the root of the second moment (3DGS).
 EPS: Final = 1e-15
-#: Decay of the first and of the second moment (3DGS).
+#: Decay rates of the first moment and of the second moment (3DGS).
 BETAS: Final = (0.9, 0.999)
 #: With more views than this, the batch rule would set the decay of the first moment to 0.
 MOST_VIEWS: Final = 10

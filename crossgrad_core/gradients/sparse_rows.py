@@ -42,7 +42,7 @@ def coalesced(gradient: Tensor | None) -> Tensor | None:
 
 def _rises(rows: Tensor) -> bool:
     """Return True if the numbers are strictly increasing."""
-    if rows.is_cpu:  # NumPy has less overhead than torch.
+    if rows.is_cpu:  # Use NumPy, because it has less overhead than torch.
         numbers = rows.numpy()
         return bool((numbers[1:] > numbers[:-1]).all())
     return bool((rows[1:] > rows[:-1]).all())

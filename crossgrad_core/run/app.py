@@ -398,7 +398,7 @@ def _train(
 
 
 def _print_results(table: str, folder: Path, words: Sequence[str]) -> None:
-    print(table)  # noqa: T201 - the result of the command
+    print(table)  # noqa: T201 - print the result of the command
     if folder.is_dir():  # Print the folder only if nobody moved it.
         print(f"results in {one_line(folder)}")  # noqa: T201
     for line in words:

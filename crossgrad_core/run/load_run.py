@@ -342,7 +342,7 @@ def as_it_was(config: RunConfig, trained: RunConfig) -> RunConfig:
 
 #: Status of a run that wrote its results and a checkpoint.
 _WITH_RESULTS: Final[tuple[Status, ...]] = ("finished", "stopped")
-#: Note of a run that has to start again.
+#: Note that a run gets if it has to start again.
 BEGINS_AGAIN = "no checkpoint yet: the run starts again from its configuration"
 
 

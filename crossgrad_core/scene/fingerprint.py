@@ -25,8 +25,8 @@ from crossgrad_core.scene.wording import name_some
 FORMAT: Final = 1
 #: Number of bytes of a file that are read at its start and at its end.
 END = 64 * 2**10
-#: Number of decimals that are stored for pixels and local units. They are far more than needed to
-#: distinguish cameras.
+#: Number of decimals that are stored for pixels and local units. This is far more precise than
+#: needed to distinguish cameras.
 DECIMALS = 6
 # Libraries on another machine may round the last digits differently.
 _TOLERANCE = 10.0 ** (1 - DECIMALS)
@@ -153,7 +153,7 @@ def mark_of(path: Path) -> FileMark:
             file.seek(max(END, size - END))
             digest.update(file.read(END))
             file.seek(0)
-            # The two ends cover a small file completely.
+            # For a small file, both ends together contain the complete file.
             whole = file_digest(file, "sha256").hexdigest() if size > 2 * END else None
     except OSError as error:
         raise UserError(

@@ -103,7 +103,7 @@ def read_cloud(path: Path, source: str) -> PointCloud:
             found=f"no {', '.join(missing)}",
             todo="export the points again",
         )
-    # Signalling NaN causes this warning. The points are left out with a note
+    # A signalling NaN causes this warning. The points are left out with a note
     with np.errstate(invalid="ignore"):
         positions = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64)
     return PointCloud(

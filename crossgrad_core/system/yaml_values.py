@@ -209,7 +209,7 @@ def _integer(text: str) -> int:
 
 
 def _float(text: str) -> float:
-    # PyYAML's `.inf` is `inf` in Python.
+    # YAML's `.inf` is `inf` in Python.
     value = float(text.replace(".", "", 1) if text.lower().endswith((".inf", ".nan")) else text)
     if isnan(value):
         raise ValueError("a value is NaN, which no setting can be")

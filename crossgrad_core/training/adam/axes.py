@@ -64,7 +64,7 @@ def _usual(scales: Tensor) -> Tensor | float:
     Non-finite values are left out, so that they do not affect other Gaussians.
     """
     sample = scales[:: -(-len(scales) // _SAMPLE)]
-    if is_native([sample]):  # NumPy has less overhead than torch.
+    if is_native([sample]):  # Use NumPy, because it has less overhead than torch.
         rows = sample.numpy()
         # Sort NaN to the end, as torch does.
         a, b, c = np.where(np.isnan(rows), np.float32(inf), rows).T

@@ -146,7 +146,7 @@ def _bargain(cosine: Matrix) -> Vector | None:
         decrement = mp.sqrt(abs(dot(slope, step)))
         damping = 1 if decrement < number("0.2") else 1 / (1 + decrement)
         beta = [b * (1 + damping * s) for b, s in zip(beta, step, strict=True)]
-        # At this decrement, the last step has squared the remaining error.
+        # Stop at this decrement, because the last step has already squared the remaining error.
         if decrement < mp.mpf("1e-25"):
             return beta
     raise UnprovenError

@@ -285,7 +285,7 @@ def compare(
     }
     write_files(folder, files, OWNED)
     for line in lines_of(comparison, notes):
-        print(one_line(line))  # noqa: T201 - the result of the command
+        print(one_line(line))  # noqa: T201 - print the result of the command
     shown, page = one_line(folder), one_line(folder / PAGE)
     print(f"\npage, figures and tables in {shown}: open {page}")  # noqa: T201
 

@@ -21,7 +21,7 @@ _BLUR, _REACH = 0.02, 0.1
 _FARTHEST = 2.0
 #: Distance of the sky, as a multiple of the distance of the farthest camera or point.
 _SKY = 2.0
-#: This share of the points may be nearer than all added points, and this share may be farther.
+#: This share of the points may be nearer than all added points. The same share may be farther.
 _TAIL = 0.02
 #: Huber's constant, with which the fit has 95 % of the efficiency of least squares.
 _HUBER, _PASSES = 1.345, 10

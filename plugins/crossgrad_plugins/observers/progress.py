@@ -155,6 +155,5 @@ class Progress(Observer):
             sys.stderr.write(text + "\n")
             sys.stderr.flush()
         else:
-            # `tqdm` writes the line above the bar. Printed in another way, the line would break the
-            # bar.
+            # `tqdm` writes the line above the bar. A normal print would break the bar.
             self._bar.write(showable(text), file=controls_of(sys.stderr))

@@ -162,7 +162,7 @@ def show(made: Plan, way: str, *, as_json: bool) -> None:
         print(json.dumps(made.as_data(), indent=2))  # noqa: T201
         return
     for line in lines_of(made, get_terminal_size((_COLUMNS, 0)).columns):
-        print(one_line(line))  # noqa: T201 - the result of the command
+        print(one_line(line))  # noqa: T201 - print the result of the command
     print(one_line(way))  # noqa: T201
 
 

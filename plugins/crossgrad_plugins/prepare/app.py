@@ -144,7 +144,7 @@ def prepare_scene(photos: Path, scene: Path, settings: Settings, threads: int | 
     """
     report = prepared(photos, scene, settings, threads)
     for line in summary_lines(report):
-        print(one_line(line))  # noqa: T201 - the result of the command
+        print(one_line(line))  # noqa: T201 - print the result of the command
     print(one_line(f"scene in {scene}; the report is {scene / 'report.md'}"))  # noqa: T201
     length, command = advised(scene)
     print(f"planned length: {length}")  # noqa: T201

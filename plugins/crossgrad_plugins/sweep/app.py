@@ -306,4 +306,4 @@ def _note(line: str) -> None:
 
 def _say(lines: Iterable[str]) -> None:
     for line in lines:
-        print(one_line(line))  # noqa: T201 - the result of the command
+        print(one_line(line))  # noqa: T201 - print the result of the command
