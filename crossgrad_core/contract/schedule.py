@@ -128,9 +128,10 @@ Unit = Literal["views", "steps"]
 REFERENCE = 30_000
 #: Length in views up to which the settings for short runs apply in full.
 SHORT = 3_000
-#: Learning rates of colour, scale and opacity are not stretched with the run, so the first
-#: transient always takes some hundred steps. Gradients are large everywhere during the transient.
-#: Growth in this time would copy Gaussians that only need to converge.
+#: The learning-rate schedules of colour, scale and opacity are not stretched to the length of the
+#: run. The first transient therefore always takes some hundred steps. Gradients are large
+#: everywhere during the transient. Growth in this time would copy Gaussians that only need to
+#: converge.
 SHORTEST_WARM_UP = 500
 #: Shortest interval over which growth statistics are collected (the published interval).
 SHORTEST_INTERVAL = 100

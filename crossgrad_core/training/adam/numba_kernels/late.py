@@ -223,8 +223,8 @@ def _step_row(
     The gradient of the row is row `grad_row` of `grad` if the row was rendered, else zero.
     """
     at, begin, g = row * width, grad_row * width, splat_wide(_ZERO)
-    # The last sixteen elements overlap with earlier elements. Compute them before the earlier
-    # elements are overwritten.
+    # The last sixteen elements overlap with earlier elements. Compute the last sixteen elements
+    # before the earlier elements are overwritten.
     tail = at + width - WIDE
     if drawn:
         g = load_wide(grad, begin + width - WIDE)
