@@ -13,10 +13,10 @@ from crossgrad_plugins.sweep.grid import Choice, Grid
 from crossgrad_plugins.sweep.job import Layout
 from crossgrad_plugins.sweep.summary import earlier_rows
 
-#: Values that a run decides at its start.
+#: Values with which a run decides a setting at its start.
 _LEFT_OPEN: Final = ("auto", ABSENT)
-#: Settings that are not compared: paths, which may be relative to the folder of the grid, and a
-#: setting that a run replaces.
+#: Settings that are not compared: paths, which may be relative to the folder of the grid, and
+#: `plan`, which a run replaces.
 _OTHERWISE: Final = ("exposure_from", "data.init", "plan")
 
 

@@ -100,7 +100,8 @@ class Table:
         origin = self._origin()
         if origin is not None:
             return all(origin.get(key) == value for key, value in self._wanted().items())
-        # Old tables have no record of their origin, and their runs cannot be evaluated again.
+        # Old tables have no record of their origin. They are accepted if their runs cannot be
+        # evaluated again.
         views = {view.name for view in self.capture.scene.views}
         return not self._has_checkpoint() and all(row["name"] in views for row in self._rows())
 
@@ -128,7 +129,7 @@ class Table:
         folder, on = self.run.results.folder, self.capture.path
         if self.path.is_file() and not self._has_checkpoint():
             raise UserError(
-                "the figures of a run belong to other views, or to another state of the run",
+                "the saved metrics of this run were measured on other views, or at another step",
                 where=self.path,
                 expected=f"figures on {on} at step {self.run.number('step'):,.0f}",
                 found="a run without checkpoints, which cannot be evaluated again",

@@ -12,7 +12,7 @@ RASTERIZERS = ("gsplat", "gswarp", "torch")
 BACKBONES = ("vanilla", "pixel", "mip", "distance", "scaffold", "octree")
 VIEWS = (1, 2, 4, 8)
 OPERATORS = ("sum", "mean", "pcgrad", "cagrad", "upgrad", "symmetric")
-#: Gaussians of the random clouds, and megapixels of their photos.
+#: Numbers of Gaussians in the random clouds, and number of megapixels of their photos.
 SIZES, PIXELS = (100_000, 1_000_000, 3_000_000), 1.0
 #: Lengths of runs with the default settings of `crossgrad run`.
 USUAL = (1_000, 7_000, 30_000)
@@ -59,7 +59,8 @@ class Case:
             "--steps": self.steps,
             "--metrics": "psnr",
             "--out": out,
-            "--split": "every",  # As gsplat does, if the photos are in one folder.
+            # If the photos are in one folder, gsplat holds out the same photos.
+            "--split": "every",
             "--eval-every": max(1, min(1_000, self.steps // 7)),
         }
         if self.part == "long":

@@ -54,7 +54,7 @@ def peak_mib() -> float:
     import resource
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    # ru_maxrss is in KiB on Linux and in bytes on macOS.
+    # `ru_maxrss` is in KiB on Linux and in bytes on macOS.
     return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)
 
 

@@ -11,9 +11,9 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 HERE = Path(__file__).parent
 DATA = HERE / "paper_data"
-#: Number of methods that are run and compared on each of the other backbones.
+#: Number of methods that are also run and compared on each of the other backbones.
 BEST = 2
-#: Grids as stored in the repository.
+#: Folder of the grids that are stored in the repository.
 GRIDS = HERE / "grids" / "paper"
 
 #: Expected relation of the first arm to the second arm.
@@ -265,7 +265,7 @@ class Figure:
     value: float | None
 
 
-#: Table -> method -> its figures, in the order of the paper.
+#: Table -> method -> its values, in the order of the paper.
 Tables: TypeAlias = Mapping[str, Mapping[str, list[Figure]]]
 
 

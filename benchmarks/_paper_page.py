@@ -14,9 +14,9 @@ from crossgrad_plugins.compare.narrative import claim
 from crossgrad_plugins.compare.ranking import noise, standings
 from crossgrad_plugins.compare.run import Run
 
-#: Arms whose runs contain probes of the gradients.
+#: Arms whose runs measure their gradients with the observer `diagnostics`.
 WATCHED = ("one view, 2x stretched", "symmetric")
-#: Equal quantity of a comparison -> the arm with two views and the arm with one view.
+#: Quantity that is equal in a comparison -> the arm with two views and the arm with one view.
 EQUAL = {
     "equal steps": ("two random views", "one view, 1x"),
     "equal views": ("two random views", "one view, 2x stretched"),
@@ -26,7 +26,7 @@ EQUAL = {
         "one view, 2x stretched, published rates",
     ),
 }
-#: Differences in the paper below this value, in dB, count as equal.
+#: Differences in the paper count as equal if they are below this value, in dB.
 _SAME = 0.1
 _HEAD = "| {} | the paper | command | ours | verdict |"
 
@@ -238,7 +238,7 @@ def _second_view(results: Results) -> Iterator[str]:
         for scene in _scenes(results)
         for name, (a, b) in EQUAL.items()
     }
-    # All rows of the table are one family of comparisons.
+    # All rows of the table belong to one family of comparisons.
     whole = [
         key
         for key, each in contrasts.items()
@@ -422,7 +422,7 @@ def _with_interval(row: Mapping[str, str], column: str) -> str:
     If the estimate is negative, the text says that there is no interval.
     """
     value, low, high = (row.get(f"{column}{end}", "") for end in ("", "_low", "_high"))
-    # Tables from before 2026-11-25 contain [0, 0] in this case.
+    # Tables from before 2026-11-25 contain [0, 0] if the estimate is below 0.
     if value and float(value) < 0.0 and not any(float(end) for end in (low, high) if end):
         return f"{_cell(row, column)} (none, the estimate is below 0)"
     if not low or not high:

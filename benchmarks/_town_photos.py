@@ -165,7 +165,8 @@ def _hit_box(eye: Vector, way: Vector, box: Array, best: float) -> tuple[float, 
     least, most = (-box[2], -box[3], box[4]), (box[2], box[3], box[5])
     entry, exit_, face = _NEAR, best, -1
     for axis in range(3):
-        # A ray parallel to a face divides by 0. Comparisons with infinities are still correct.
+        # If a ray is parallel to a face, this divides by 0. Comparisons with the resulting
+        # infinities are still correct.
         first = (least[axis] - begin[axis]) / ahead[axis]
         second = (most[axis] - begin[axis]) / ahead[axis]
         if min(first, second) > entry:

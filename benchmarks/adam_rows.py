@@ -22,7 +22,8 @@ from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.training.adam import late
 from crossgrad_core.training.adam.adam import counted
 
-#: Number of adjacent rows in a group, number of alternating selections, and shares of drawn rows.
+#: Number of adjacent rows in a group, number of selections that alternate, and shares of the rows
+#: that are rendered.
 RUN, CHOICES, SHARES = 64, 8, (0.1, 0.2, 0.3, 0.5, 0.7)
 
 

@@ -25,9 +25,9 @@ from crossgrad_plugins.compare.quantity import Quantity
 from crossgrad_plugins.compare.run import Run
 
 PSNR = Quantity.of("psnr")
-#: Row of the table -> its regimes in scenes. None stands for all views.
+#: Row of the table -> names of its regimes in the scenes. None stands for all views.
 REGIMES = {"overall": (None,), "far": ("far", "aerial"), "near": ("near", "street")}
-#: Keys of summary.json -> column titles.
+#: Key of summary.json -> title of the column.
 NUMBERS = {"step": "steps", "views": "views", "primitives": "Gaussians", "cpu_seconds": "CPU s"}
 
 

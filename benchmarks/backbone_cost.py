@@ -29,7 +29,8 @@ from crossgrad_core.training.start import first_state, warm_up
 from crossgrad_core.training.state import TrainState
 
 BACKBONES = ("vanilla", "pixel", "mip", "analytic", "distance", "scaffold", "octree")
-#: A step of the published schedule with all SH bands, far enough from the next edit.
+#: A step of the published schedule in which all SH bands are trained. It is far enough from the
+#: next edit.
 START = 5001
 REPS_BETWEEN_EDITS = 90
 
@@ -48,7 +49,8 @@ def on_one_view(setup: Setup, state: TrainState) -> Setup:
     """Return the run restricted to its first training view, in the middle of the schedule."""
     scene = replace(setup.scene, train=setup.scene.train[:1])
     state.step = START
-    state.states.pop("sampler", None)  # The sampler stores an order of all views.
+    # Remove the state of the sampler, because it contains an order of all views.
+    state.states.pop("sampler", None)
     return replace(setup, scene=scene)
 
 

@@ -26,7 +26,7 @@ from _machine import code, facts
 STEP = Path(__file__).with_name("step.py")
 #: Name -> environment of a process.
 WAYS = {
-    "crossgrad": {"OMP_WAIT_POLICY": "PASSIVE"},  # as set by the command
+    "crossgrad": {"OMP_WAIT_POLICY": "PASSIVE"},  # as the command sets it
     "OpenMP's own": {},
     "spin 1,000": {"GOMP_SPINCOUNT": "1000"},
     "spin 10,000": {"GOMP_SPINCOUNT": "10000"},

@@ -24,7 +24,7 @@ from crossgrad_core.training.step import final_edits
 from crossgrad_plugins.rules.floaters import Floaters, in_empty_space
 
 _METRICS = ("psnr", "psnr_cc")
-#: Smaller changes of a photo are not shown, in dB.
+#: Changes of a photo below this value, in dB, are not shown.
 SMALLEST = 0.005
 
 
@@ -47,7 +47,7 @@ def row(folder: Path, empty: float) -> Sequence[str]:
         eval_parameters(setup, state)[setup.backbone.positions].detach().double().cpu().numpy()
     )
     near = int(in_empty_space(positions.double().cpu().numpy(), setup.scene, empty).sum())
-    before = measured(setup, state)  # Also compiles the code that is timed below.
+    before = measured(setup, state)  # This call also compiles the code that is timed below.
     start = perf_counter()
     list(final_edits(setup, state))
     seconds = perf_counter() - start

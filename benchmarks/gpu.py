@@ -70,7 +70,7 @@ class Short:
         self.scene, self._kept, self._place = scene, kept, place
         self._known: dict[str, Row] = {}
         for line in kept.read_text(encoding="utf-8").splitlines() if kept.is_file() else []:
-            # The last line may be truncated.
+            # Skip the last line if it is truncated.
             with suppress(json.JSONDecodeError, KeyError):
                 row = json.loads(line)
                 self._known[row.pop("case")] = row
@@ -86,7 +86,7 @@ class Short:
         try:
             found = self._measured(case)
         except Exception as error:
-            # One failed case must not end the table, unless the GPU is no longer usable.
+            # A failed case must not end the table, unless the GPU can no longer be used.
             torch.cuda.synchronize()
             return _row(case, {"note": " ".join(f"{type(error).__name__}: {error}".split())})
         row = _row(case, found)
@@ -103,7 +103,7 @@ class Short:
         before = torch.cuda.memory_allocated()
         setup, state = self._begun(case)
         setup.rasterizer.self_test("cuda")
-        guard = RollbackGuard(state)  # A run also keeps a copy for rollback.
+        guard = RollbackGuard(state)  # Keep a copy of the state for a rollback, as a run does.
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
         seconds = steady(setup, state, case.steps)
@@ -171,7 +171,8 @@ def measured(case: Case, scene: Path, out: Path) -> tuple[Path | None, str]:
         return place, ""
     why = " ".join(ended.stderr.split())
     if ended.returncode == 2:
-        # Invalid input stays invalid. Other failures are tried again by the next command.
+        # Store the reason of invalid input, because invalid input stays invalid. The next command
+        # tries other failures again.
         folder.mkdir(parents=True, exist_ok=True)
         refused.write_text(why, encoding="utf-8")
     return None, why

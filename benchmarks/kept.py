@@ -20,13 +20,13 @@ from typing import TypeAlias
 from crossgrad_core.commands import UserError, read_rows, summary_of, write_atomically
 from crossgrad_core.system.text_files import csv_bytes
 
-#: The table of a sweep, which assigns each run to a configuration.
+#: The table of a sweep. It assigns each run to a configuration.
 TABLE = "runs.csv"
-#: Rows of this table. The first row is the header.
+#: Rows of this table, of which the first row is the header.
 Rows: TypeAlias = Sequence[Sequence[str]]
 
-#: Files of a run that are packed. The second line is written by the observer `diagnostics`, and
-#: the last line by distances.py.
+#: Files of a run that are packed. The observer `diagnostics` writes the files in the second line,
+#: and distances.py writes the files in the last line.
 FILES = (
     *("config.yaml", "summary.json", "metrics.csv", "per_view.csv", "scene.json"),
     *("diagnostics.csv", "cameras.csv", "groupings.csv"),
@@ -90,7 +90,8 @@ def _is_finished(run: Path) -> bool:
 
 def _kept(sweep: Path, runs: list[Path]) -> Iterator[Path]:
     yield sweep / TABLE
-    # Group files by name: similar files next to each other compress to a third of the size.
+    # Group the files by name. Similar files then follow each other and are compressed to a third of
+    # the size.
     for name in FILES:
         yield from (path for run in runs for path in sorted(run.glob(name)))
 

@@ -32,9 +32,10 @@ from typing import Any
 import numpy as np
 from _machine import code, facts
 
-#: Enlargement of the bundled photos.
+#: Factor by which the bundled photos are enlarged.
 SCALE = 10
-#: Standard deviation of the grain in grey levels, and JPEG quality. A file has about 4 MB.
+#: Standard deviation of the grain in grey levels, and JPEG quality. With these values, a file has
+#: about 4 MB.
 GRAIN, QUALITY = 4.0, 92
 BUNDLED = Path(__file__).parents[1] / "examples" / "scenes" / "boruszyn"
 

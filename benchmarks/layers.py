@@ -95,7 +95,7 @@ def draw(path: Path) -> None:
     for level in range(max(layer.values()) + 1):
         here = sorted(package for package in graph if layer[package] == level)
         for number, package in enumerate(here):
-            # Shift rows against each other, so that arrows pass between the boxes.
+            # Shift every second row of boxes, so that arrows can pass between the boxes.
             shift = 0.25 * (level % 2 * 2 - 1)
             places[package] = (WIDTH * (number + 1) / (len(here) + 1) + shift, float(level))
     figure, axes = plt.subplots(figsize=(WIDTH, HEIGHT))

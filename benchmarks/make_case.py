@@ -20,7 +20,7 @@ from torch.nn.functional import normalize
 
 Arrays = dict[str, NDArray[np.generic]]
 
-#: Number of Gaussians of the garden within [-2, 2] on every axis.
+#: Number of Gaussians in the scene `garden` within [-2, 2] on every axis.
 GAUSSIANS = 111_785
 WIDTH, HEIGHT, FOCAL = 648, 420, 481.0
 LEAST_SCALE, LARGEST_SCALE = 1e-4, 0.02

@@ -73,7 +73,7 @@ def main() -> None:
     settings = {"steps": given.steps, "threads": 1, "data": reading}
     with tempfile.TemporaryDirectory() as folder:
         scenes = {}
-        # Write both scenes, because writing may change the order of the points.
+        # Write both scenes in the same way, because writing may change the order of the points.
         for name, offset in (("in place", (0.0, 0.0, 0.0)), ("moved", given.offset)):
             path = moved(given.scene, offset, Path(folder) / name)
             scenes[name] = read_scene(RunConfig(scene=path, **settings), path)[0]

@@ -35,7 +35,7 @@ from crossgrad_core.gradients.summed import SummedGradients
 from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.registry.entries import build, entries
 
-#: Block -> elements per Gaussian and kind, as in the vanilla backbone with SH degree 3.
+#: Block -> number of elements per Gaussian, and kind, as in the vanilla backbone with SH degree 3.
 WIDTHS: dict[str, tuple[int, BlockKind]] = {
     "means": (3, "geometry"),
     "scales": (3, "geometry"),

@@ -40,9 +40,9 @@ ROOT = Path(__file__).parents[1]
 #: Tuned arm -> scene -> factor of the learning rates.
 Factors: TypeAlias = Mapping[str, Mapping[str, float]]
 CROSSGRAD = [sys.executable, "-m", "crossgrad_core"]
-#: CPU seconds of a view at 400 px, and of a run in addition to its views (libraries, scene,
-#: evaluation, results). Measured with one run of 1,200 views per scene, two views per step, on one
-#: shared core of an AMD EPYC.
+#: CPU seconds of a view at 400 px, and CPU seconds of a run in addition to its views (libraries,
+#: scene, evaluation, results). Measured with one run of 1,200 views per scene, two views per step,
+#: on one shared core of an AMD EPYC.
 VIEW, BESIDES = 0.049, 12.0
 #: Cost of a view relative to vanilla (docs/benchmarks.md, Cost of backbones).
 COSTS = {
@@ -53,7 +53,7 @@ COSTS = {
     "pixel": 1.1,
     "distance": 1.35,
 }
-#: Seconds of the probes of a run.
+#: Seconds that a run needs for the measurements of its gradients.
 PROBES = 25.0
 
 
@@ -148,7 +148,7 @@ class Paper:
         sweeps = {name: self.place.sweep(name) for name in grids}
         return read_results(sweeps, grids, self.given.set or ())
 
-    # The steps of `run`.
+    # The following methods are the steps of `run`, in their order.
 
     def unpack(self) -> None:
         """Add finished runs from the packed tables."""
@@ -164,7 +164,7 @@ class Paper:
         self.unpack()
         self.tell()
         worst = self._swept(self.plan.tuning, _as_mapping(self.source(self.plan.tuning)))
-        if worst > 2:  # Stopped by a signal.
+        if worst > 2:  # A signal has stopped the sweep.
             return worst
         factors = self._factors()
         for name in self.names:
@@ -172,7 +172,7 @@ class Paper:
             if content is None:
                 continue
             code = self._swept(name, content)
-            if code > 2:  # Stopped by a signal.
+            if code > 2:  # A signal has stopped the sweep.
                 return code
             worst = max(worst, code)
             self.write_page()
@@ -362,7 +362,7 @@ def _as_mapping(grid: Grid) -> dict[str, Any]:
 def _packed(sweep: Path, archive: Path) -> None:
     try:
         pack(sweep, archive)
-    except UserError as error:  # No run has finished, and failures are already printed.
+    except UserError as error:  # No run has finished. The failures have already been printed.
         print(error.what, file=sys.stderr)
 
 
@@ -373,7 +373,8 @@ def _call(arguments: Sequence[str]) -> int:
         try:
             code = process.wait()
         except KeyboardInterrupt:
-            continue  # The process stops its runs with checkpoints, and then ends.
+            # Wait again, because the process saves checkpoints of its runs before it ends.
+            continue
         return exit_code(-code) if code < 0 else code
 
 

@@ -23,9 +23,9 @@ import pycolmap
 from _machine import code, facts
 from numpy.typing import NDArray
 
-#: A camera is found if its error is within this share of the scene's size.
+#: The pose of a camera counts as found if its error is at most this share of the scene's size.
 CLOSE = 0.005
-#: A camera agrees with a similarity if its error is within this share of the scene's size.
+#: A camera agrees with a similarity if its error is at most this share of the scene's size.
 AGREES = 0.01
 
 Poses = Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
@@ -104,7 +104,8 @@ def main() -> None:
     parser.add_argument("photos", type=Path)
     parser.add_argument("scene", type=Path)
     parser.add_argument("--truth", type=Path, action="append", default=[])
-    # Split by hand, because argparse cannot pass options after a list of positional arguments.
+    # Split the words here, because argparse cannot read options after a list of positional
+    # arguments.
     words = [*sys.argv[1:], "--"]
     ours = words.index("--")
     given = parser.parse_args(words[:ours])

@@ -24,12 +24,13 @@ from _machine import code, facts
 from numpy.typing import NDArray
 from prepare import CLOSE, Poses, errors_of, poses_of
 
-#: Least number of matches for each column of the table.
+#: Minimum number of matches for each column of the table.
 BOUNDS = (15, 20, 30, 60, 100)
-#: Pixels to the epipolar line, and least share of matches within this distance.
+#: Maximum distance in pixels between a match and its epipolar line, and minimum share of matches
+#: within this distance.
 NEAR, RIGHT = 4.0, 0.5
-#: Thresholds for a pose, COLMAP's and half of them: number of points, and share of the tried
-#: points.
+#: Thresholds for a pose: first COLMAP's values, then half of each value. A threshold is a number of
+#: points and a share of the tested points.
 THRESHOLDS = ((30, 0.25), (15, 0.125))
 
 Matrix = NDArray[np.float64]

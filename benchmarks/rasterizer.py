@@ -41,7 +41,8 @@ def main() -> None:
     parser.add_argument("--reps", type=int, default=30)
     parser.add_argument("--save", type=Path)
     arguments = parser.parse_args()
-    # As in a run: the same threads for torch, and freed arrays are kept for the next step.
+    # Use the settings of a run: the same number of threads for torch, and freed arrays that are
+    # kept for the next step.
     configure_threads()
     with np.load(arguments.case) as archive:
         case = dict(archive)

@@ -26,16 +26,17 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-#: Options of every run: three edits, a reset, and evaluations before and after the stop.
+#: Options of every run. They cause three edits, a reset, and evaluations before and after the stop.
 USUAL = (
     *("--steps", "60", "--max-size", "100", "--threads", "1", "--quiet"),
     *("--set", "densify_from=20", "--set", "densify_every=10", "--set", "densify_until=55"),
     *("--set", "reset_every=30", "--set", "eval_every=20", "--stop-after", "30"),
 )
-#: Columns of metrics.csv that differ between any two runs.
+#: Columns of metrics.csv that differ even between two equal runs.
 CLOCKS = {"train_seconds", "cpu_seconds", "peak_memory_mib"}
 
-#: Program in the tested environment: command lines arrive as JSON, exit codes return as JSON.
+#: Program that runs in the tested environment. It receives command lines as JSON and returns exit
+#: codes as JSON.
 CHILD = """
 import contextlib, io, json, sys
 from crossgrad_core.cli.main import main

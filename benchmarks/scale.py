@@ -40,16 +40,19 @@ if TYPE_CHECKING:
     from crossgrad_core.training.setup import Setup
     from crossgrad_core.training.state import TrainState
 
-#: A step of the published schedule with SH degree 3 and gathered statistics, far from an edit.
+#: A step of the published schedule with SH degree 3 that gathers statistics and is far from an
+#: edit.
 STEP = 5_010
-#: A step that edits.
+#: A step in which density control edits.
 EDIT = 5_100
-#: Steps that compile, decode photos and fill memory before the measurement.
+#: Number of steps before the measurement. These steps compile kernels, decode photos and fill
+#: memory.
 WARM_UP = 3
 #: Number of photos in each direction.
 PHOTOS = 4
-#: Bytes that a step moves for a Gaussian of degree 3: for an unseen Gaussian (11 geometry
-#: parameters and their moments, read and written) and for a drawn one (59 parameters, gradients).
+#: Number of bytes that a step moves per Gaussian of degree 3. First value: for a Gaussian that is
+#: not rendered (11 geometry parameters and their moments, read and written). Second value: for a
+#: rendered Gaussian (59 parameters, their moments and gradients).
 UNSEEN, SEEN = 11 * 6 * 4, 59 * 8 * 4
 
 
@@ -169,7 +172,7 @@ def _view(direction: int, number: int, size: tuple[int, int]) -> "View":
     pose = np.eye(4)
     pose[:3, :3] = _turn(2 * np.pi * direction / 10).T
     pose[:3, 3] = -pose[:3, :3] @ (0.01 * np.array([number, 0.5 * number, 0.0]))
-    # The field of view is 30 degrees, so that ten directions do not overlap.
+    # Use a field of view of 30 degrees, so that ten directions do not overlap.
     focal = 0.5 * size[0] / np.tan(np.deg2rad(15))
     calibration = (focal, focal, size[0] / 2, size[1] / 2)
     camera = Camera(*size, *calibration, torch.from_numpy(pose))
@@ -193,7 +196,8 @@ def _points(cell: Cell) -> np.ndarray:
     local = np.column_stack([flat, depth])
     direction = np.arange(cell.gaussians) // cell.visible
     angles = 2 * np.pi * direction / 10
-    # With one direction, the other clouds are behind the camera. With ten, each is seen.
+    # With one direction, the other clouds are behind the camera. With ten directions, each cloud is
+    # seen by a photo.
     if cell.directions == 1:
         angles = np.where(direction > 0, np.pi, 0.0)
     c, s = np.cos(angles), np.sin(angles)
@@ -221,7 +225,8 @@ def setup_of(cell: Cell, **options: object) -> "Setup":
             "max_gaussians": cell.gaussians,
             "growth": "unbounded",
             "schedule_unit": "steps",
-            "rules": {"dropout": False},  # Each photo sees all Gaussians in front of it.
+            # Switch dropout off, so that each photo renders all Gaussians in front of its camera.
+            "rules": {"dropout": False},
             **options,
         }
     )

@@ -39,7 +39,8 @@ from crossgrad_core.run.export import renderer
 from crossgrad_core.scene.self_check.evidence import pixels_of
 from crossgrad_core.scene.self_check.verdict import Verdict, verdict_of
 
-#: The check must report a scene whose held-out PSNR falls by this value, in dB.
+#: The check must report a scene if its error lowers the held-out PSNR by at least this value, in
+#: dB.
 FALL = 3.0
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from crossgrad_core.run.results.reading import RunResults, find_runs, read_run
 
-#: Least number of evaluations in the last tenth for a measurement of jitter.
+#: Minimum number of evaluations in the last tenth of a run for a measurement of jitter.
 FEWEST = 10
 LAST = 0.1
 

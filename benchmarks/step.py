@@ -42,7 +42,7 @@ from crossgrad_core.training.adam.late import Late
 from crossgrad_plugins.losses.l1_ssim import photometric_loss
 from crossgrad_plugins.rasterizers.numba_cpu import NumbaRasterizer
 
-#: Late enough for SH degree 3 in the published schedule.
+#: In the published schedule, this step is late enough for SH degree 3.
 STEP = 5000
 
 
@@ -81,9 +81,9 @@ class Trainer:
         self.rasterizer = NumbaRasterizer(max_alpha=max_alpha, near=0.01)
         self.phase = Phase(STEP, training=True, schedule=Schedule.for_run(30_000))
         self.state, self.late = AdamState(), Late()
-        #: True if every step is completed before the next step.
+        #: True if every step must be complete before the next step starts.
         self.apart = False
-        # With rates of zero, the case stays the same in all repetitions, at the same cost.
+        # Use learning rates of zero. All repetitions then have the same case and the same cost.
         self.rates = dict.fromkeys(self.parameters, 0.0)
 
     def step(self, camera: Camera, photo: Tensor, *, rests: bool) -> Iterator[str]:
@@ -149,15 +149,16 @@ def main() -> None:
     photo = torch.from_numpy(np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8))
     every = arguments.sh_every
     parts = ("render", "loss", "backward", "adam")
-    # Steps that update all bands, and steps that skip the higher bands.
+    # Separate times of steps that update all SH bands and of steps that skip the higher bands.
     marks: list[dict[str, list[float]]] = [{name: [] for name in parts} for _ in range(2)]
     for repetition in range(2 * (arguments.reps + 2) * min(every, 2)):
-        # A step that skips bands follows a step with the other view that updates them.
+        # A step that skips bands comes after a step that renders the other view and updates these
+        # bands.
         rests = every > 1 and repetition % 4 == 3
         start = perf_counter()
         for name in trainer.step(views[repetition % 2], photo, rests=rests):
             end = perf_counter()
-            # The first steps compile and warm up.
+            # Do not measure the first steps, which compile kernels and warm up.
             if repetition >= 4 * min(every, 2) and repetition % 2:
                 marks[rests][name].append(end - start)
             start = perf_counter()

@@ -67,7 +67,7 @@ def measured(arguments: argparse.Namespace, folder: Path) -> None:
         encoding="utf-8",
     )
     workers = arguments.workers
-    for threads in (1, workers):  # Compile the kernels before any measurement.
+    for threads in (1, workers):  # Compile the kernels before the measurements.
         command = [*CROSSGRAD, "run", str(arguments.scene), "--steps", "20", "-q"]
         command += ["--threads", str(threads), "--out", str(folder / f"warm-{threads}")]
         call(command)

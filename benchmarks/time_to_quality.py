@@ -82,7 +82,7 @@ def run(given: argparse.Namespace) -> None:
         # Compile all kernels that a run needs before any timed run.
         warm = given.out / f"warm-up-{code.name}-{given.core[0]}"
         if not warm.exists():
-            # The option --clock is refused without seconds.
+            # Without a time budget, the option --clock is refused.
             timed = any(option.partition("=")[0] == "--clock" for option in code.options)
             length = ("--seconds", "60") if timed else ("--steps", "700")
             code.train(given.scene[0], warm, *kind, *length)
@@ -102,7 +102,7 @@ def run(given: argparse.Namespace) -> None:
                 code.train(scene, folders[code], *kind, option, length, "--seed", str(seed))
         for code, folder in folders.items():
             row = {"code": code.name, "scene": scene.name, "lengths": lengths, "seed": seed}
-            # The slow renderer is only used for small photos.
+            # Use the independent renderer only for small photos, because it is slow.
             row |= _figures(folder, folders[codes[-1]], independent=given.max_size > 0)
             (folder / "row.json").write_text(json.dumps(row))
 
@@ -176,7 +176,8 @@ def table(given: argparse.Namespace) -> None:
     old: dict[tuple[str, str], dict[int, Row]] = {}
     for (scene, lengths), codes in cases:
         if "old" in codes:
-            # If a code ran without `old`, compare it with the first runs of `old` of equal length.
+            # If a case was run without the code `old`, compare it with the first case of equal
+            # length that was run with `old`.
             old[scene, lengths] = codes["old"]
             first, _, unit = lengths.partition(" ")
             alone = " ".join([first.split(":")[0], *([unit] if unit else [])])

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-#: Rays of a pixel in each direction.
+#: Number of rays of a pixel in each direction.
 RAYS: Final = 2
 POINTS: Final = 40_000
 #: Half of the horizontal field of view, in degrees.
@@ -30,7 +30,7 @@ HALF_ANGLE: Final = {"aerial": 25, "street": 35}
 Integers: TypeAlias = NDArray[np.int64]
 #: Number of blocks and roads in each direction from the middle.
 REACH: Final = 2
-#: Of each kind, one photo out of this many photos is held out.
+#: Among the photos of each kind, one photo out of this many photos is held out.
 EVERY: Final = 8
 
 
@@ -153,7 +153,7 @@ def build(rng: np.random.Generator) -> Town:
     for x, y, _ in _beside_roads(rng, 24, pitch, road / 2 + 1.5):
         high = rng.uniform(1.0, 2.2)
         trees.append([x, y, 1.6 + high, rng.uniform(0.9, 1.8), high])
-    for x, y, upright in _beside_roads(rng, 16, pitch, road / 2 - 1.2):  # Cars and booths.
+    for x, y, upright in _beside_roads(rng, 16, pitch, road / 2 - 1.2):  # Add cars and booths.
         lengths = (0.9, 2.1) if upright else (2.1, 0.9)
         boxes.append([x, y, *lengths, 0, rng.uniform(1.3, 2.4), 1, 0])
     rows = np.array(boxes, float)
@@ -177,7 +177,7 @@ def fly(rng: np.random.Generator, town: Town, count: int, width: int) -> list[Vi
     """Return the photos of the drone."""
     way = rng.integers(0, 3)
     low, high = sorted(rng.uniform(60, 115, 2))
-    # One more than the square root, so that held-out photos are not in one column.
+    # Use one row more than the square root, so that held-out photos are not all in one column.
     views, rows = [], math.isqrt(count) + 1
     for i in range(count):
         z, share = rng.uniform(low, high), i / count

@@ -105,7 +105,7 @@ def work(checkout: Path, case: Path, threads: int) -> None:
 class Plain:
     """The step of commits up to e216204, whose benchmark consists of one function."""
 
-    def __init__(self, steps: Any, case: dict[str, Any]) -> None:  # noqa: ANN401 - another checkout's
+    def __init__(self, steps: Any, case: dict[str, Any]) -> None:  # noqa: ANN401 - a module of another checkout
         self.steps, self.parameters = steps, steps.parameters_of(case)
         self.backbone, self.state = steps.Vanilla(), steps.AdamState()
         self.rasterizer = steps.NumbaRasterizer(max_alpha=0.999, near=0.01)
@@ -113,7 +113,7 @@ class Plain:
         self.phase = steps.Phase(steps.STEP, training=True, schedule=schedule)
         self.rates = dict.fromkeys(self.parameters, 0.0)
 
-    def step(self, camera: Any, photo: Any, *, rests: bool) -> list[str]:  # noqa: ANN401 - as above
+    def step(self, camera: Any, photo: Any, *, rests: bool) -> list[str]:  # noqa: ANN401 - see above
         """Take a step."""
         gaussians = self.backbone.decode(self.parameters, camera, self.phase)
         image = self.rasterizer.render(gaussians, camera, self.steps.torch.zeros(3)).image
@@ -131,7 +131,7 @@ def beside(case: Path, other: Path, threads: int, rounds: int) -> dict[str, Any]
     workers = [Worker(HERE, case, threads, core), Worker(other, case, threads, core)]
     seconds: list[list[float]] = [[], []]
     for turn in range(WARM_UP + rounds):
-        # The sides alternate in being first.
+        # The two checkouts take turns at making the first step of a round.
         for side in (0, 1) if turn % 2 else (1, 0):
             took = workers[side].step()
             if turn >= WARM_UP:

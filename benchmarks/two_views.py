@@ -23,7 +23,7 @@ from crossgrad_plugins.compare.narrative import needed_text, verdict_text
 from crossgrad_plugins.compare.statistics import Verdict
 
 ONE, TWO = "one view", "two views"
-#: Equal quantities of a comparison -> its two arms, the arm with two views first.
+#: Quantity that is equal in a comparison -> its two arms, the arm with two views first.
 PAIRS = {
     "seconds": (f"{TWO}, equal seconds", f"{ONE}, equal seconds"),
     "views, events and count": (
@@ -43,7 +43,7 @@ PAIRS = {
         f"{ONE}, equal views, statistics of an extra render",
     ),
 }
-#: Title of a table -> ending of the names of its arms.
+#: Title of a table -> last part of the names of its arms.
 RATES = {"at the best rates": ", best", "at the published rates": ""}
 
 

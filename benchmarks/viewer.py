@@ -18,8 +18,8 @@ import crossgrad_core as cg
 
 Array = NDArray[np.float64]
 
-#: Rules of 3DGS: least alpha, greatest alpha, transmittance at which a pixel ends, dilation in
-#: px^2, near plane (camera units), and the margin for clamping the Jacobian.
+#: Constants of 3DGS: minimum alpha, maximum alpha, transmittance at which a pixel ends, dilation in
+#: px^2, near plane in camera units, and margin for clamping the Jacobian.
 LEAST, CAP, STOP, DILATION, NEAR, MARGIN = 1 / 255, 0.99, 1e-4, 0.3, 1e-3, 1.3
 
 

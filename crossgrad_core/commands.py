@@ -189,7 +189,8 @@ __all__ = [
 
 #: Exit code of a command whose training failed.
 FAILED: Final = 1
-#: Name that is imported on first access -> its module, and its name there if that is different.
+#: Name that is imported on first access -> its module. If the name in the module is different, this
+#: name follows.
 _LATE: Final = {
     "ComponentChoice": "config",
     "DEFAULT_STEPS": "run.decisions",

@@ -23,7 +23,8 @@ from crossgrad_core.contract.schedule import ScheduleMode, Unit, ViewsPerStepSpe
 AUTO: Final = "auto"
 #: Settings of a run that do not change its training.
 CHANGEABLE: Final = frozenset({"device", "threads", "stop_after"})
-#: Growth of primitives: as density control requests, or by a budget for the length of the run.
+#: How the number of primitives grows: as the densifier requests, or by a budget for the length of
+#: the run.
 Growth: TypeAlias = Literal["unbounded", "budget"]
 
 

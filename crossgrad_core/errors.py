@@ -5,8 +5,8 @@ from typing import Final
 
 from crossgrad_core.wording import one_line, showable
 
-#: Maximum length of one part of a message, and of its `where`; the middle of a longer text is left
-#: out.
+#: Maximum number of characters in one part of a message, and in its part `where`. A longer text
+#: loses its middle.
 LONGEST: Final = 500
 LONGEST_PLACE: Final = 1000
 

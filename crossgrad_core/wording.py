@@ -4,8 +4,8 @@ import re
 from collections.abc import Iterable
 
 # Control characters could move the cursor or recolour the terminal. Characters of bidirectional
-# text reorder a line. Lone surrogates represent bytes that are not UTF-8; they cannot be written to
-# a file.
+# text reorder a line. Lone surrogates represent bytes that are not UTF-8, and they cannot be
+# written to a file.
 _UNSHOWABLE = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 

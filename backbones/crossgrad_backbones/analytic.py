@@ -12,7 +12,8 @@ from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_backbones.visibility import NEAR
 from crossgrad_core.plugin import Camera, Gaussians, Phase, Response
 
-#: Variance of a one-pixel window, px^2: integration over the window adds it to a Gaussian's.
+#: Variance of a window of one pixel, px^2. Integration over the window adds this variance to the
+#: variance of a Gaussian.
 PIXEL_VARIANCE = 1.0 / 12.0
 
 

@@ -12,7 +12,7 @@ from crossgrad_core.plugin import Camera, Gaussians
 
 #: Value that viewers add to both diagonal entries of the 2-D covariance, px^2 (3DGS).
 FILE_DILATION = 0.3
-#: A variance keeps at least this share of its value.
+#: A reduced variance keeps at least this share of its value.
 FLOOR = 1e-4
 
 

@@ -25,7 +25,8 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: Minimum distance in local units, because a camera at the mean centre has no logarithmic distance.
+#: Minimum distance in local units. Without it, a camera at the mean centre would have no
+#: logarithmic distance.
 NEAREST = 1e-3
 #: All distances count as equal if the standard deviation of their logarithms is below this value.
 LEAST_SPREAD = 1e-6
@@ -96,7 +97,7 @@ def largest_addition(scale: Tensor, weights: Tensor) -> Tensor:
     """Return the maximum [N] of w_1 z + w_2 z^2 for weights [N, 2] within the range of z."""
     first, second = weights.unbind(1)
     least, most = scale[5:].to(weights)
-    # A parabola is largest at an end of the range, or at its vertex if it opens downwards.
+    # The maximum of a parabola is at an end of the range, or at its vertex if it opens downwards.
     vertex = torch.where(second < 0, -first / (2 * second), least)
     vertex = torch.minimum(torch.maximum(vertex, least), most)
     sums: Tensor = torch.stack([z * first + z * z * second for z in (least, vertex, most)])
@@ -120,7 +121,7 @@ def _log_distances(centers: Tensor, middle: Tensor) -> Tensor:
     return distances.clamp(min=NEAREST).log()
 
 
-#: Name of the tensor from `fitted_scale`.
+#: Name of the tensor that `fitted_scale` returns.
 SCALE = "distances"
 
 

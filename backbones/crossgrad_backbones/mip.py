@@ -32,7 +32,8 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: Variance of the filter in squared pixels of the camera with the finest pixels at a Gaussian.
+#: Variance of the filter in squared pixels. The pixels are those of the camera with the finest
+#: pixels at a Gaussian.
 VARIANCE = 0.2
 
 
@@ -89,7 +90,7 @@ class _Smoothed(torch.autograd.Function):
         kept = scales.div_(smooth)
         opacities = sigmoid(logits)
         drawn = opacities * kept.prod(1)
-        # Compute in place, because at this size new memory costs more than the arithmetic.
+        # Compute in place, because allocating memory of this size takes longer than the arithmetic.
         shares = kept.square_(), filters.div_(smooth).square_()
         ctx.save_for_backward(smooth, *shares, opacities, drawn)
         return smooth, drawn
@@ -187,7 +188,7 @@ class MipSplatting(Vanilla):
     def capped_opacities(self, parameters: Mapping[str, Tensor], cap: float) -> Tensor:
         """Cap the filtered opacity, then divide by the filter's factor to get the stored value."""
         kept = kept_opacity(parameters["scales"], parameters["filter"])
-        # If an opacity of 1 stays below the cap, the logit is infinite, so there is no limit.
+        # If even an opacity of 1 stays below the cap, the logit is infinite, which means no limit.
         limit = torch.logit((cap / kept).clamp(max=1.0))
         return torch.minimum(parameters["opacities"].detach(), limit)
 

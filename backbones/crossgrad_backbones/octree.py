@@ -119,7 +119,7 @@ def visible_share(shares: Tensor, asked: float) -> float:
 
 
 Rounding = Literal["round", "floor", "ceil", "progressive"]
-#: Number of levels beyond L* that are used (see `Lattice.lead`).
+#: Rounding of L* -> number of levels beyond L* that a camera sees (see `Lattice.lead`).
 _LEADS: Mapping[Rounding, float] = {"round": 0.5, "floor": 0.0, "ceil": 1.0, "progressive": 1.0}
 
 

@@ -74,7 +74,7 @@ class Vanilla(Backbone):
         return (*rows, rest)
 
     def _scales_lr(self) -> LearningRate:
-        # Value measured for crossgrad (docs/schedules.md).
+        # This factor was measured for crossgrad (docs/schedules.md).
         return LearningRate(self.lr_scales, few_passes=2.0)
 
     def _means_lr(self) -> LearningRate:

@@ -7,10 +7,11 @@ from torch import Tensor
 
 from crossgrad_core.plugin import Camera
 
-#: A centre counts as seen if it is inside the image enlarged by this share of its size on each
-#: side.
+#: A centre counts as seen if it is inside the enlarged image. The image is enlarged by this share
+#: of its size on each side.
 MARGIN = 0.15
-#: Minimum distance of a seen centre from the camera, in local units (the rasterizers' default).
+#: Minimum distance in local units of a centre from the camera that sees it. It is the default of
+#: the rasterizers.
 NEAR = 1e-3
 
 

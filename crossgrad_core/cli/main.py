@@ -148,16 +148,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Args:
         arguments: The words after `crossgrad`; `sys.argv[1:]` by default.
     """
-    if arguments is None:  # If this function runs, the process belongs to the command.
+    # The command line calls this function without arguments. In this case, the process belongs to
+    # the command.
+    if arguments is None:
         outlast_readers()
     try:
-        # Not `app()`, which would replace `sys.excepthook`.
+        # Do not call `app()`, because it would replace `sys.excepthook`.
         get_command(app)(args=arguments, prog_name="crossgrad")
     except Exception as error:
         user_error = error if isinstance(error, UserError) else failed_plugin(error)
         if user_error is None and isinstance(error, OSError) and is_too_long(error):
             user_error = path_too_long(error.filename)
-        if user_error is None:  # Bugs of crossgrad keep their traceback.
+        if user_error is None:  # An error that is a bug of crossgrad keeps its traceback.
             raise
         finish()
         print(f"error: {user_error}", file=sys.stderr)  # noqa: T201

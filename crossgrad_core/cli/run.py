@@ -16,7 +16,7 @@ from crossgrad_core.system.command_options import print_all_options
 from crossgrad_core.system.startup import announce
 from crossgrad_core.wording import listed
 
-#: Options that concern only this start of the command.
+#: Options that apply only to this start of the command.
 _OF_THE_COMMAND: Final = frozenset(
     {"resume", "accept_scene", "accept_plugins", "check", "quiet", "verbose"}
 )
@@ -81,7 +81,7 @@ def _own(
 
 
 #: Options that are not settings. The help shows them before the settings, after the first setting
-#: of the results, or last.
+#: that concerns results, or last.
 _FRONT: Final = (
     _own(
         "config",

@@ -118,9 +118,9 @@ def primitives_of(blocks: tuple[Block, ...], parameters: Mapping[str, Tensor]) -
     return 0
 
 
-#: Names of states that belong to the components of slots.
+#: Names of plugin states that the components of slots use.
 SLOTS: Final = frozenset({"densifier", "operator", "resolution", "sampler"})
-#: Names of states that belong to the slots and the core; no other plugin may use them.
+#: Names of plugin states that are reserved for slots and the core. No other plugin may use them.
 TAKEN: Final = SLOTS | {"budget", "grouping", "photos", "thinned"}
 Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
 
@@ -185,7 +185,8 @@ def carried(old: Tensor, source: Tensor, fresh: Tensor) -> Tensor:
     return new
 
 
-#: The state of a plugin before it stores one; read-only, because all runs of a process share it.
+#: The empty state of a plugin that has not stored a state yet. It is read-only, because all runs of
+#: a process share it.
 EMPTY_STATE = PluginState(MappingProxyType({}), MappingProxyType({}), MappingProxyType({}))
 
 
@@ -331,7 +332,7 @@ def _edited(edit: Edit, name: str, old: Tensor) -> Tensor:
         return old
     if edit.source is None:
         tensor = old.detach().clone()
-    else:  # A plugin may list rows on another device than the parameters.
+    else:  # The rows that a plugin lists may be on another device than the parameters.
         tensor = old.detach().index_select(0, edit.source.to(old.device))
     if overwrite is not None:
         rows = slice(None) if overwrite.rows is None else overwrite.rows
@@ -355,7 +356,7 @@ def apply_to_moment(edit: Edit, name: str, old: Tensor) -> Tensor:
 
 #: Epsilon that is added to the root of the second moment (3DGS).
 EPS: Final = 1e-15
-#: Decay of the first and of the second moment (3DGS).
+#: Decay rates of the first moment and of the second moment (3DGS).
 BETAS: Final = (0.9, 0.999)
 #: With more views than this, the batch rule would set the decay of the first moment to 0.
 MOST_VIEWS: Final = 10

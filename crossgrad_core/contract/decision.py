@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final, TypeAlias
 
-#: Settings that change with the length if the clock makes a run longer or shorter.
+#: Settings that are decided again if a time budget makes a run longer or shorter.
 FOLLOWING: Final = ("rate_factor", "growth", "max_gaussians", "min_refinements", "sh_start")
 
 

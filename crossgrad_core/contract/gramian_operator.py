@@ -148,7 +148,8 @@ def aggregate_by_gramians(
     weights = np.where(present, _added_rows(matrices, gradients.unit), 0.0)
     if not np.isfinite(weights).all():
         raise _not_finite(operator, given, weights)
-    # Count before the sum, because the sum may overwrite gradients that the count reads again.
+    # Compute the counts before the weighted sum, because the sum may overwrite gradients that the
+    # counts still need.
     counts = _counts(gradients, granularity, gramians, present)
     return AggregateResult(gradients.combine(weights, granularity), counts), state
 

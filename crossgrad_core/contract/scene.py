@@ -137,12 +137,13 @@ def check_coordinates(name: str) -> None:
 
 #: Minimum number of cameras for a search for stray cameras.
 _FEWEST: Final = 5
-#: Largest share of stray cameras; a single stray camera is always possible.
+#: Largest share of stray cameras. A single stray camera is always possible.
 _MOST: Final = 0.1
-#: Distance of a stray camera from the middle, divided by the distance of all other cameras and of
-#: the points.
+#: A camera is stray if its distance from the middle is more than this many times the distance of
+#: all other cameras and of the points.
 _FAR: Final = 10.0
-#: Quantile of the points' distances, because single points may be stray, too.
+#: Quantile of the points' distances that is used instead of the maximum, because single points may
+#: be stray, too.
 _OF_POINTS: Final = 0.9
 
 
@@ -379,11 +380,13 @@ def centers_of(views: Sequence[View]) -> NDArray[np.float64]:
     return np.stack([view.camera.center.numpy() for view in views]).astype(np.float64)
 
 
-#: A median over fewer observed points is unreliable; points in the image are used instead.
+#: With fewer observed points than this, a median is unreliable, so points in the image are used
+#: instead.
 _FEWEST_SEEN = 3
-#: Points tested against the image of a view that observed too few.
+#: Maximum number of points that are tested against the image of a view that observed too few
+#: points.
 _MOST_TESTED = 50_000
-#: Significant bits of a length between cameras; further bits are rounding errors.
+#: Number of significant bits of a length between cameras. Further bits are rounding errors.
 _BITS = 40
 #: Relative error of an input coordinate from its rounding and the rounding of a few sums.
 _ROUNDED = 16 * float(np.finfo(np.float64).eps)

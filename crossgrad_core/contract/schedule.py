@@ -128,9 +128,10 @@ Unit = Literal["views", "steps"]
 REFERENCE = 30_000
 #: Length in views up to which the settings for short runs apply in full.
 SHORT = 3_000
-#: Learning rates of colour, scale and opacity are not stretched with the run, so the first
-#: transient always takes some hundred steps. Gradients are large everywhere during the transient.
-#: Growth in this time would copy Gaussians that only need to converge.
+#: The learning-rate schedules of colour, scale and opacity are not stretched to the length of the
+#: run. The first transient therefore always takes some hundred steps. Gradients are large
+#: everywhere during the transient. Growth in this time would copy Gaussians that only need to
+#: converge.
 SHORTEST_WARM_UP = 500
 #: Shortest interval over which growth statistics are collected (the published interval).
 SHORTEST_INTERVAL = 100
@@ -138,7 +139,7 @@ SHORTEST_INTERVAL = 100
 #: interval. It is half the published interval, because short runs grow too few anchors
 #: (docs/benchmarks.md).
 SHORTEST_ANCHOR_INTERVAL = 50
-#: Shorter runs make no opacity reset, because they are too short to recover from it.
+#: Runs shorter than this make no opacity reset, because they are too short to recover from it.
 SHORTEST_RUN_WITH_RESET = 10_000
 #: If edits are counted in views, an interval is one pass over the training photos. The interval is
 #: shorter if the run would otherwise make fewer edits than this number.
@@ -246,7 +247,7 @@ class Schedule:
             length=length,
             lr_until=length,
             sh_interval=max(100, length // 30),
-            densify_from=0,  # `with_edits` plans these edits.
+            densify_from=0,  # `with_edits` sets the times of edits later.
             densify_until=0,
             densify_every=1,
             reset_every=length // 10 if length >= SHORTEST_RUN_WITH_RESET else None,
@@ -281,8 +282,7 @@ class Schedule:
         if self.counting.unit == "views" and not self.published:
             every = max(every, min(photos, (last - start) // USUAL_EDITS))
         if self.min_refinements:
-            # The warm-up is not shortened to one pass over the photos if one pass is longer than
-            # the warm-up.
+            # The interval is at least one pass over the photos, if this leaves enough edits.
             whole = max(every, photos) if photos <= last // self.min_refinements else every
             start, every = _fitted(start, last, whole, photos, self.min_refinements)
         return replace(self, densify_from=start, densify_until=until, densify_every=every)

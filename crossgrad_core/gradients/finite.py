@@ -12,7 +12,7 @@ from crossgrad_core.gradients.columns import is_native
 from crossgrad_core.gradients.sparse_rows import values_of
 
 _INFINITY: Final = int(np.float32(np.inf).view(np.uint32))
-#: Up to this many parts are processed by one thread.
+#: At most this many parts are processed by one thread.
 _FEW: Final = 8
 
 
@@ -47,7 +47,7 @@ def all_finite_and_present(tensors: Sequence[Tensor | None]) -> list[tuple[bool,
             most = next(bits)
             results.append((most < _INFINITY, most > 0))
         elif not tensor.is_cpu and tensor.is_floating_point():
-            # Use one pass and one wait for the device.
+            # `largest` reads the tensor once and waits for the device once.
             value = float(largest(tensor))
             results.append((isfinite(value), value > 0.0))
         else:

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from crossgrad_core.gradients.columns import Column
 
-#: Elements of K gradients that are converted to float64 at a time. Short pieces on the CPU keep the
-#: rounding errors of long float64 sums small; long pieces are faster on a GPU.
+#: Number of elements of K gradients that are converted to float64 at a time. Short pieces on the
+#: CPU keep the rounding errors of long float64 sums small. Long pieces are faster on a GPU.
 PIECE = {"cpu": 1 << 14, "cuda": 1 << 22}
 
 

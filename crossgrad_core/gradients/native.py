@@ -9,7 +9,7 @@ from torch import Tensor
 
 from crossgrad_core.gradients.columns import Column
 
-#: Up to this many elements, one core is faster than several.
+#: Up to this number of elements, one core is faster than several cores.
 SMALL: Final = 1 << 17
 
 

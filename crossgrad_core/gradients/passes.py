@@ -11,7 +11,8 @@ from torch import Tensor
 from crossgrad_core.gradients import generic, native
 from crossgrad_core.gradients.columns import Column, is_native
 
-#: Range of magnitudes of float64 gradients whose squares and products stay inside float64.
+#: Range of magnitudes. If float64 gradients are in this range, their squares and products stay
+#: inside float64.
 SAFE: Final = (1e-140, 1e140)
 
 

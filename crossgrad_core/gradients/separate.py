@@ -120,7 +120,8 @@ class DenseGradients(SeparateGradients):
     @override
     def overlap(self, granularity: Granularity) -> NDArray[np.bool_]:
         gramians, present = self.gramians(granularity), self.present(granularity)
-        # Gradients with a non-zero dot product share an element; only the other pairs need a check.
+        # Gradients with a non-zero dot product share an element, so only pairs with a zero dot
+        # product need a check.
         shared: NDArray[np.bool_] = gramians != 0
         doubtful = ~shared & present[:, :, None] & present[:, None, :]
         for i, j in np.argwhere(np.triu(doubtful.any(axis=0), 1)).tolist():
@@ -319,7 +320,7 @@ class DenseGradients(SeparateGradients):
     def _order(self, weights: NDArray[np.float64], plain: NDArray[np.bool_]) -> NDArray[np.int64]:
         """Return [T, K] view indices, largest summand first; plain sums keep the order of views."""
         order = np.tile(np.arange(self._views), (len(self._tensors), 1))
-        # The order of two summands has no effect.
+        # With two views, the order of the summands has no effect.
         if self._views > 2 and not plain.all():  # noqa: PLR2004
             squares = _diagonal(self._squares)
             norms = np.sqrt(np.where(np.isfinite(squares), squares, 0.0))

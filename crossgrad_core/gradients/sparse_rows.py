@@ -19,12 +19,12 @@ def sparse_rows(rows: Tensor, values: Tensor, shape: Sequence[int]) -> Tensor:
 
 def rows_of(gradient: Tensor) -> Tensor:
     """Return [R] int64 rows of a sparse gradient."""
-    return gradient._indices()[0]  # noqa: SLF001 - the public name wants a flag that autograd drops
+    return gradient._indices()[0]  # noqa: SLF001 - the public function needs a flag that autograd drops
 
 
 def values_of(gradient: Tensor) -> Tensor:
     """Return [R, ...] values of a sparse gradient."""
-    return gradient._values()  # noqa: SLF001 - as above
+    return gradient._values()  # noqa: SLF001 - see above
 
 
 def coalesced(gradient: Tensor | None) -> Tensor | None:
@@ -35,13 +35,14 @@ def coalesced(gradient: Tensor | None) -> Tensor | None:
         return gradient.to_dense()
     rows = rows_of(gradient)
     if not gradient.is_coalesced() and _rises(rows):
-        gradient._coalesced_(True)  # Torch's own flag, so that torch does not sort again.
+        # Mark the tensor as coalesced, so that torch does not sort its rows again.
+        gradient._coalesced_(True)
     return gradient.coalesce()
 
 
 def _rises(rows: Tensor) -> bool:
     """Return True if the numbers are strictly increasing."""
-    if rows.is_cpu:  # NumPy has less overhead than torch.
+    if rows.is_cpu:  # Use NumPy, because it has less overhead than torch.
         numbers = rows.numpy()
         return bool((numbers[1:] > numbers[:-1]).all())
     return bool((rows[1:] > rows[:-1]).all())
@@ -83,7 +84,7 @@ class PackedRows:
         """Return a result of the column as a gradient of the whole tensor."""
         if result is None or self.rows is None:
             return result
-        # Torch's own flag, so that torch does not sort again.
+        # Mark the tensor as coalesced, so that torch does not sort its rows again.
         return sparse_rows(self.rows, result, self.shape)._coalesced_(self._tidy)
 
 

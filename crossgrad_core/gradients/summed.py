@@ -89,7 +89,7 @@ class SummedGradients(Gradients):
         self._last: dict[str, Tensor] = {}
         self._divisor = 0
         self._views = self._expected = views
-        #: Checked gradients, and their versions at the time of the check.
+        #: Gradients that were checked, with their tensor versions at the time of the check.
         self._looked: dict[str, tuple[Tensor, int]] = {}
         self._finite: list[NDArray[np.bool_]] = []
         self._present: list[NDArray[np.bool_]] = []

@@ -12,15 +12,15 @@ R = TypeVar("R")
 
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 _COMPILE = cast("Callable[..., Any]", njit)
-#: Allow fused multiply-add and ignore the sign of zero. All other arithmetic is IEEE in the written
-#: order, so NaN and infinity stay visible.
+#: Allow fused multiply-add and ignore the sign of zero. All other arithmetic follows IEEE 754 in
+#: the order of the source code, so NaN and infinity stay visible.
 _FLAGS = {"contract", "nsz"}
 
 
 def compiled(function: Callable[P, R], **options: Any) -> Callable[P, R]:  # noqa: ANN401
     """Compile an entry point with options of Numba's `njit`; cached on disk."""
     dispatcher = _COMPILE(**_OPTIONS, **options)(function)
-    dispatcher._cache = cache_for(function)  # noqa: SLF001 (Numba has no public way)
+    dispatcher._cache = cache_for(function)  # noqa: SLF001 - Numba has no public function for this
     return cast("Callable[P, R]", dispatcher)
 
 

@@ -17,7 +17,7 @@ Therefore, a thread reads the data that it wrote in the previous kernel, and the
 still contains this data. The result of a job must not depend on the thread that runs the job. Then
 the number of threads does not change any bit of the results.
 """
-# ruff: noqa: ANN401, ARG001 - Numba's objects have no types, and it fixes the arguments.
+# ruff: noqa: ANN401, ARG001 - Numba's objects have no types, and Numba defines the arguments.
 
 import atexit
 import os

@@ -28,7 +28,8 @@ _FOLDERS = "numba_kernels"
 _CORE = __name__.partition(".")[0]
 _DUMPS = cast("Callable[[object], bytes]", dumps)
 _LOG = logging.getLogger(__name__)
-#: Log messages before and after the compilation of a kernel; `system/startup.py` reads them.
+#: Log messages before and after the compilation of a kernel. `system/startup.py` reads these
+#: messages.
 _COMPILING, _COMPILED = "compiling %s", "compiled %s"
 
 
@@ -130,7 +131,7 @@ class _DiskCache(cast("Any", FunctionCache)):  # type: ignore[misc]
         try:
             super().save_overload(sig, data)
         except OSError as error:
-            # Saving can fail, for example on a full disk; the compiled function is still valid.
+            # Saving can fail, for example on a full disk. The compiled function is still valid.
             self.disable()
             _tell_unwritten(str(self._cache_path), str(error))
 
@@ -199,7 +200,7 @@ class _Files:
     def _drop_older(self) -> None:
         for path in self._folder.glob(f"{self._base}.*"):
             if not path.name.startswith(self._generation) and path.suffix != ".tmp":
-                # Another process may have removed it first, or may hold it open.
+                # Another process may have removed the file first, or may hold the file open.
                 with suppress(OSError):
                     path.unlink()
 

@@ -6,7 +6,8 @@ from typing import Final
 ALPHA_THRESHOLD: Final = 1.0 / 255.0
 #: Compositing stops before a blend that would bring the transmittance below this value.
 TRANSMITTANCE_STOP: Final = 1e-4
-#: The Jacobian is evaluated inside the image plus this share of half its extent on either side.
+#: The position at which the Jacobian is evaluated is limited to the image plus a margin on each
+#: side. The margin is this share of half the image's extent.
 JACOBIAN_MARGIN: Final = 0.3
 #: Band 0 of the real spherical harmonics: 1 / (2 sqrt(pi)).
 SH_C0: Final = 0.28209479177387814

@@ -12,7 +12,7 @@ machine that supports it, so the same expression in two kernels gives the same b
 Functions exist only inside compiled kernels; `Lanes` and `Mask` are annotations. A kernel that
 needs other lane operations can define them with `emitted` and the helpers of this module.
 """
-# ruff: noqa: ANN401, ARG005 - Numba's objects have no types, and it fixes the arguments.
+# ruff: noqa: ANN401, ARG005 - Numba's objects have no types, and Numba defines the arguments.
 
 import operator
 from collections.abc import Callable, Sequence
@@ -30,7 +30,7 @@ LANES = 8
 WIDE = 2 * LANES
 
 _FLOAT, _BYTE, _INT, _LONG = ir.FloatType(), ir.IntType(8), ir.IntType(32), ir.IntType(64)
-_ALIGNMENT = 4  # bytes; float32 arrays guarantee no larger alignment
+_ALIGNMENT = 4  # In bytes. Float32 arrays guarantee no larger alignment
 _SIGN_BIT, _MANTISSA_BITS = -(2**31), 23
 
 
@@ -64,7 +64,7 @@ class _MaskType(types.Type):
         cast("Any", super()).__init__(name=f"Mask{width}")
 
 
-#: Types of vectors; they are called with a width.
+#: Types of vectors. To get a type, call them with a width.
 _lanes, _mask = _LanesType, _MaskType
 
 
@@ -147,7 +147,7 @@ def _define(sign: Callable[[Any, Any], Any], emit: Callable[..., Any], kind: Any
     """Define a Python operator for two values of one kind."""
     implementation = emitted(emit, to, kind, kind)
 
-    @overload(sign, strict=False)  # the annotations are not part of the signature
+    @overload(sign, strict=False)  # The annotations are not part of the signature
     def _overloaded(a: Any, b: Any) -> Any:
         if isinstance(a, kind) and a == b:
             return lambda a, b: implementation(a, b)  # noqa: PLW0108 - Numba compiles the lambda
@@ -274,7 +274,7 @@ def _parts(at: Site, array: Any, index: Any, count: int = 3) -> list[Any]:
 
 def _prefetch(at: Site, array: Any, index: Any, *, write: int) -> Any:
     address = _element(at, array, index, _BYTE)
-    # Keep the line in all cache levels (3); it holds data, not instructions (1).
+    # The cache line stays in all cache levels (3). It contains data, not instructions (1).
     _llvm("llvm.prefetch.p0", ir.VoidType())(at, address, _INT(write), _INT(3), _INT(1))
     return at.context.get_dummy_value()
 
@@ -310,7 +310,7 @@ def _scale_by_power(at: Site, value: Any, shifted: Any) -> Any:
 def _sums(at: Site, *args: Any) -> Any:
     rows = list(args)
     for width in (1, 2, 4):
-        # Fold groups of `width` lanes onto their neighbours, two vectors into one.
+        # Add groups of `width` lanes to the neighbouring groups. Two vectors become one.
         starts = [s + o for s in range(0, LANES, 2 * width) for o in (0, LANES)]
         low = [start + lane for start in starts for lane in range(width)]
         high = [lane + width for lane in low]
@@ -343,7 +343,8 @@ ramp: Callable[[], Lanes] = emitted(_ramp(LANES), _eight)
 load: Callable[[_Array, int], Lanes] = emitted(_load(LANES), _eight, None, types.intp)
 #: Return one number of a flat float32 array in all lanes.
 broadcast: Callable[[_Array, int], Lanes] = emitted(_broadcast(LANES), _eight, None, types.intp)
-#: Return four consecutive numbers of a flat float32 array, twice.
+#: Return four consecutive numbers of a flat float32 array in lanes 0 to 3, and again in lanes 4 to
+#: 7.
 broadcast_four: Callable[[_Array, int], Lanes] = emitted(
     _broadcast_four(LANES), _eight, None, types.intp
 )
@@ -357,7 +358,7 @@ load_wide: Callable[[_Array, int], Lanes] = emitted(_load(WIDE), SIXTEEN, None, 
 broadcast_wide: Callable[[_Array, int], Lanes] = emitted(
     _broadcast(WIDE), SIXTEEN, None, types.intp
 )
-#: Return four consecutive numbers of a flat float32 array, four times.
+#: Return four consecutive numbers of a flat float32 array in each group of four lanes.
 broadcast_four_wide: Callable[[_Array, int], Lanes] = emitted(
     _broadcast_four(WIDE), SIXTEEN, None, types.intp
 )

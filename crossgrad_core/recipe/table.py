@@ -28,10 +28,10 @@ DECIDED: Final = (
     *("position_lr", "rate_factor", "few_pass_rates", "beta1", "beta2", "step_order"),
     *("eval_every", "save_every"),
 )
-#: Setting whose rows in the table are rules: `rules.NAME` has the options of the rule as its value,
+#: First part of the names of rows for rules. The row `rules.NAME` contains the options of the rule,
 #: or False if the rule is not used.
 RULES: Final = "rules"
-#: Largest number of decision lines in the terminal.
+#: Maximum number of decision lines in the terminal.
 LINES: Final = 12
 
 

@@ -184,7 +184,8 @@ def refuse_other_version(entry: Entry) -> None:
 
 def notes_on(error: BaseException) -> list[str]:
     """Return the notes on the step, hook and plugin in which an exception was raised."""
-    # Keep the order of the notes: the hook adds its note first.
+    # The hook adds its note before the step does. Reverse the notes, so that the note on the step
+    # comes first.
     return list(reversed(getattr(error, "__notes__", ())))
 
 
@@ -209,7 +210,7 @@ def failed_plugin(error: Exception) -> UserError | None:
     raising = [(entry, line) for entry in others if (line := raised_at(error, entry.package))]
     if not raising:
         return None
-    # If two distributions share a package, prefer the one that contains the module.
+    # If two distributions share a package, prefer the distribution that contains the module.
     entry, line = next((one for one in raising if one[1].startswith(f"{one[0].file}:")), raising[0])
     return UserError(
         f"a plugin of package {entry.distribution} {entry.version} raised an error",
@@ -299,7 +300,8 @@ def _offers(path: tuple[str, ...]) -> dict[str, tuple[Entry, ...]]:  # noqa: ARG
     """Return slot -> entries; the argument is `sys.path`, so that a new path is scanned again."""
     from importlib.metadata import entry_points
 
-    # One call without a filter, because each call scans every installed distribution.
+    # Call `entry_points` once and without a filter, because each call scans every installed
+    # distribution.
     points = entry_points()
     offers_by_slot: dict[str, tuple[Entry, ...]] = {}
     groups = [*OFFERED.items(), (PLANNERS, f"crossgrad.{PLANNERS}")]

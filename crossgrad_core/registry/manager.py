@@ -49,7 +49,8 @@ class _Manager(pluggy.PluginManager):
 
     @override
     def parse_hookimpl_opts(self, plugin: object, name: str) -> Any:
-        if self._asked[0] is not plugin:  # pluggy handles one plugin after the other.
+        # pluggy reads all methods of a plugin before it reads the next plugin.
+        if self._asked[0] is not plugin:
             self._asked = plugin, _may_be_hooks(plugin)
         return super().parse_hookimpl_opts(plugin, name) if name in self._asked[1] else None
 

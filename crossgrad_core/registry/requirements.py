@@ -18,7 +18,8 @@ def unmet_requirement(distribution: str) -> str:
         lines = requires(distribution) or []
     except (PackageNotFoundError, ValueError):
         return ""
-    # Packages have many requirements; few of them begin with this name.
+    # Parse only requirements that begin with this name, because packages have many other
+    # requirements.
     return next(filter(None, map(_refusing, filter(_may_be_ours, lines))), "")
 
 

@@ -33,13 +33,14 @@ GROUPS: Final[dict[str, str]] = {
 }
 #: Slots that a run fills with a list of components.
 LISTS: Final = ("metrics", "observers")
-#: Slots that a run fills with any number of components; `rules` is a mapping of names.
+#: Slots that a run fills with any number of components. The value of `rules` is a mapping of names.
 MANY: Final = (*LISTS, "rules")
-#: The group of commands that packages add to `crossgrad`; not a slot of a run.
+#: The group of commands that packages add to `crossgrad`. It is not a slot of a run.
 COMMANDS: Final = "commands"
 #: Everything that packages can offer -> entry-point group.
 OFFERED: Final[dict[str, str]] = {**GROUPS, COMMANDS: f"crossgrad.{COMMANDS}"}
-#: The group of planners, which decide settings of a run by its scene (`--plan`); not a slot.
+#: The group of planners, which decide settings of a run from its scene (`--plan`). It is not a slot
+#: of a run.
 PLANNERS: Final = "planners"
 #: Slot -> entry-point group of functions that answer for `auto` before a component is imported:
 #: `accepts` of a reader, `speed` of a rasterizer.
@@ -47,7 +48,7 @@ QUICK: Final = {
     "readers": "crossgrad.readers.accepts",
     "rasterizers": "crossgrad.rasterizers.speed",
 }
-#: The core's own commands; no plugin replaces them.
+#: The core's own commands. No plugin replaces them.
 OWN_COMMANDS: Final = ("run", "eval", "render", "export")
 _KNOWN: Final = (*OFFERED.values(), *QUICK.values(), f"crossgrad.{PLANNERS}")
 _PREFIX: Final = "crossgrad"

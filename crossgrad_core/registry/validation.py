@@ -98,7 +98,7 @@ def _inside(annotation: object, part: str) -> tuple[type[BaseModel] | None, obje
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         field = annotation.model_fields.get(part)
         return annotation, field.annotation if field else None
-    # The values of a list, a tuple or a mapping.
+    # Return the type of the values of a list, a tuple or a mapping.
     arguments = [argument for argument in get_args(annotation) if argument is not ...]
     return None, arguments[-1] if arguments else None
 

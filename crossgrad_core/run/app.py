@@ -129,7 +129,7 @@ def bundled_scene() -> Path:
 
 
 _LOG = logging.getLogger(__name__)
-#: Exit code of a failed run; its results so far are kept.
+#: Exit code of a failed run. The results that the run wrote before the failure are kept.
 FAILED = 1
 
 
@@ -155,8 +155,8 @@ class Outcome:
         return 0 if self.signal is None else exit_code(self.signal)
 
 
-#: Function that receives the results (table, folder and exit messages) while signals are still only
-#: recorded.
+#: Function that receives the results (table, folder and exit messages). It is called while signals
+#: are recorded but do not yet end the process.
 Tell = Callable[[str, Path, Sequence[str]], None]
 
 
@@ -316,7 +316,8 @@ def _tried_out() -> Iterator[None]:
     """
     try:
         yield
-    # Errors that numbers can cause; any other error is a bug of crossgrad and keeps its traceback.
+    # Numerical or memory problems can cause these errors. Any other error is a bug of crossgrad and
+    # keeps its traceback.
     except (TrainingFailedError, NonFiniteError, RuntimeError, ValueError, MemoryError) as error:
         if isinstance(error, UserError) or failed_plugin(error):
             raise
@@ -397,7 +398,7 @@ def _train(
 
 
 def _print_results(table: str, folder: Path, words: Sequence[str]) -> None:
-    print(table)  # noqa: T201 - the result of the command
+    print(table)  # noqa: T201 - print the result of the command
     if folder.is_dir():  # Print the folder only if nobody moved it.
         print(f"results in {one_line(folder)}")  # noqa: T201
     for line in words:
@@ -433,7 +434,8 @@ def resumed(
         step, total = state.step, setup.schedule.total
         done = step >= total and summarised_step(folder, "finished") == step
         files = PER_VIEW, f"{CLOUD}.{setup.selection.exporter.suffix}"
-        damaged = set(changed_files(folder)) - {CONFIG}  # Settings are compared separately.
+        # Leave out the configuration file, because its settings are compared separately.
+        damaged = set(changed_files(folder)) - {CONFIG}
         if done and not damaged and all((folder / name).is_file() for name in files):
             raise UserError(
                 "the run is finished, so that it cannot be resumed",

@@ -29,7 +29,7 @@ FEWEST_SEEN: Final = 8
 #: With more views than this, the ends of a zoom path are chosen from an even sample of this size.
 MOST_VIEWS: Final = 500
 _TODO: Final = "write the file with nerfstudio's viewer, or as described in docs/runs.md"
-#: Longer paths are refused as a mistake.
+#: A camera path with more frames than this is refused, because it is probably a mistake.
 MOST_FRAMES: Final = 100_000
 _Floats = NDArray[np.float64]
 

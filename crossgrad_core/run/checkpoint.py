@@ -163,7 +163,7 @@ def _clear(folder: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
 
 
-#: Version of the layout; increased if an older reader could misread a newer checkpoint.
+#: Version of the layout. It is raised if an older reader could misread a newer checkpoint.
 FORMAT = 1
 _DIGEST = "state_sha256"
 
@@ -339,7 +339,7 @@ def write_tensors(path: Path, packed: dict[str, Tensor]) -> None:
         path.touch()
         mode = path.stat().st_mode
         save_file(packed, path)
-        # The library creates a new file that only its owner may read.
+        # safetensors creates a new file that only its owner may read.
         path.chmod(mode)
         sync_file(path)
     except SafetensorError as error:
@@ -359,9 +359,11 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     from safetensors.torch import load, load_file
 
     try:
-        if showable(str(path)) != str(path):  # The library opens names in UTF-8 only.
+        # safetensors opens only files whose names are valid UTF-8.
+        if showable(str(path)) != str(path):
             return load(path.read_bytes())
-        # Clone the tensors, because the library maps the file, which a later checkpoint may delete.
+        # Clone the tensors, because safetensors maps the file and a later checkpoint may delete the
+        # file.
         return {key: tensor.clone() for key, tensor in load_file(path).items()}
     except SafetensorError as error:
         raise ValueError(str(error)) from error
@@ -407,7 +409,8 @@ def save(run: Path, checkpoint: Checkpoint, keep: Keep | None = None) -> Path:
         try:
             _write(final, tensors, state)
         except OSError as error:
-            # Deleting the dropped checkpoints first may free enough space; the newest one stays.
+            # The disk is full. Delete the checkpoints that are no longer kept, which may free
+            # enough space. The newest checkpoint stays.
             if not is_full(error) or not _drop(final.parent, keep, checkpoint.step):
                 raise
             _write(final, tensors, state)
@@ -494,7 +497,7 @@ def load(folder: Path) -> Checkpoint:
         raise damaged(folder, f"{TENSORS} has changed since it was written (its SHA-256 differs)")
     try:
         packed = read_tensors(folder / TENSORS)
-        # The library sorts by key; the order of parameters must survive too.
+        # safetensors sorts the tensors by key, but the order of the parameters must stay the same.
         tensors = unpack({key: packed[key] for key in state["tensors"]})
         return Checkpoint(
             step=state["step"],

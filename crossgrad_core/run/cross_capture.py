@@ -19,14 +19,15 @@ from crossgrad_core.training.setup import Setup
 #: A view counts as a training view if its pose is nearer to a training pose than these limits:
 #: local units (extents), and radians.
 SAME_PLACE, SAME_DIRECTION = 1e-3, 1e-2
-#: The capture is accepted if at least this share of its points is inside the box around the run's
-#: points and cameras, enlarged by this factor.
+#: A capture is accepted if at least the first value, a share of its points, is inside a box. The
+#: box contains the run's points and cameras and is enlarged by the second value, a factor.
 LEAST_SHARED, MARGIN = 0.1, 1.1
 #: Points of two captures of one place are on the same surfaces. Their median distance from the
 #: run's points is at most this share of the median after any of `TURNS` random rotations about the
 #: middle of the capture.
 LEAST_ALIKE, TURNS = 0.4, 9
-#: Numbers of points for this test: minimum, maximum from the other capture, maximum from the run.
+#: Minimum number of points for this test, maximum number of points from the other capture, and
+#: maximum number of points from the run.
 FEWEST_POINTS, MOST_POINTS, MOST_OWN = 200, 2_000, 50_000
 
 
@@ -116,7 +117,7 @@ def _moved(camera: Camera, other: Scene, similarity: Similarity) -> Camera:
 def _are_trained(views: Sequence[View], trained: Sequence[View]) -> list[bool]:
     """Return for each view whether its pose is the pose of a training view."""
     centers, rotations = centers_of(trained), _rotations_of(trained)
-    # The trace of the rotation between two cameras falls with the angle between them.
+    # The trace of the rotation between two cameras decreases when the angle between them increases.
     least = 1.0 + 2.0 * math.cos(SAME_DIRECTION)
 
     def is_trained(center: NDArray[np.float64], rotation: NDArray[np.float64]) -> bool:

@@ -89,8 +89,8 @@ def with_decisions(
             setting; see also `facts_of`.
     """
     if config.seconds is not None:
-        # The number of steps for the time budget is planned again, and all settings that depend on
-        # the length.
+        # Plan the number of steps for the time budget again, and decide again all settings that
+        # depend on the length.
         config = open_again(config)
     if is_complete(config):
         return config, rows_of(config), repeats

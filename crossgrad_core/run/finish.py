@@ -28,7 +28,8 @@ from crossgrad_core.training.state import PhaseTimer, RollbackGuard, TrainingFai
 from crossgrad_core.training.step import final_edits
 from crossgrad_core.wording import one_line
 
-#: Texts in errors of torch that mean out of memory; some of these errors also have their own type.
+#: Texts in torch errors that report exhausted memory. Some of these errors also have their own
+#: type.
 _NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory")
 
 
@@ -67,8 +68,8 @@ def _place(error: BaseException) -> str:
     return f" ({Path(last.filename).name}, line {last.lineno}, in {last.name})"
 
 
-#: A run whose last evaluation is more than this many decibels below its best one reports it. With
-#: few held-out photos, single evaluations always differ by smaller amounts.
+#: A run reports if its last evaluation is more than this many decibels below its best evaluation.
+#: With few held-out photos, smaller differences between evaluations are normal.
 WORSE: Final = 0.3
 _T = TypeVar("_T")
 
@@ -156,7 +157,8 @@ class RunLoop:
                     return
                 revised = length.revised(self.setup, state)
                 if revised is not self.setup:
-                    # Do not allow a rollback to a step before the length changed.
+                    # Copy the state, so that a later rollback cannot return to a step before the
+                    # change of length.
                     guard.copy(state)
                 # If the configuration is the same object, the planned length is already written.
                 if revised.config is not self.setup.config:
@@ -309,7 +311,8 @@ def _kept(course: RunLoop) -> list[str]:
     return [f"the state of step {step} could not be saved; {there}"]
 
 
-#: Steps and training seconds to observe before the estimate; the very first step is left out.
+#: Number of steps and number of training seconds to observe before the estimate. The very first
+#: step is left out.
 LOOK_STEPS, LOOK_SECONDS = 3, 2.0
 #: No estimate is shown if less time than this remains, in seconds.
 WORTH_A_LINE = 60.0

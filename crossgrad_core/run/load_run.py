@@ -83,7 +83,7 @@ _LOOSE: Final = frozenset(
         "threads",
     }
 )
-#: Component that another machine may lack.
+#: Slot whose component may be missing on another machine.
 _DRAWN: Final = "rasterizer"
 #: Key that records whether the length follows a time budget.
 _TIMED: Final = "time budget"
@@ -99,7 +99,7 @@ def settings_of(config: RunConfig) -> dict[str, Json]:
     data = config.model_dump(mode="json", exclude=loose)
     # Another machine may use another rasterizer, but its options still count.
     del data[_DRAWN]["name"]
-    # The default is equal to that of `_config`, for a run that did not write this setting.
+    # Use the default of `_config` for a run that did not write this setting.
     data |= {
         "sh_from": config.sh_from or 0,
     }
@@ -166,14 +166,17 @@ def check_settings(config: RunConfig, checkpoint: Checkpoint) -> None:
     """
     stored = checkpoint.scalars.get("settings")
     if not isinstance(stored, dict) or stored.get("crossgrad") != VERSION:
-        return  # Another version wrote the checkpoint: it stored no settings, or under other names.
+        # Another version wrote the checkpoint. It stored no settings, or it used other names for
+        # them.
+        return
     ours = settings_of(config)
     # A setting that did not exist when the checkpoint was written is not a change. A new option of
     # a component may be a change.
     known_components = {key.partition(".")[0] for key in stored}
     both = {key for key in ours.keys() | stored.keys() if key.partition(".")[0] in known_components}
-    # Another rasterizer has other options. A length that follows a time budget lacks these
-    # settings.
+    # Ignore settings that only the configuration or only the checkpoint contains, if they are
+    # options of the rasterizer or settings of the length. Another rasterizer has other options. A
+    # run with a time budget lacks the settings of the length.
     either = {_DRAWN, "steps", "revisions", "revised"}
     both -= {k for k in ours.keys() ^ stored.keys() if k.partition(".")[0] in either}
     changed = sorted(key for key in both if ours.get(key) != stored.get(key))
@@ -277,7 +280,7 @@ def _record(plain: dict[str, Any] | None) -> StepRecord | None:
 
 
 _LOG = logging.getLogger(__name__)
-#: Slot -> default component that replaces a missing one.
+#: Slot -> default component that replaces a missing component.
 _PLAIN: Final = {
     "sampler": defaults.SAMPLER,
     "operator": defaults.OPERATOR,
@@ -339,7 +342,7 @@ def as_it_was(config: RunConfig, trained: RunConfig) -> RunConfig:
 
 #: Status of a run that wrote its results and a checkpoint.
 _WITH_RESULTS: Final[tuple[Status, ...]] = ("finished", "stopped")
-#: Note of a run that has to start again.
+#: Note that a run gets if it has to start again.
 BEGINS_AGAIN = "no checkpoint yet: the run starts again from its configuration"
 
 
@@ -489,7 +492,8 @@ def _from(
     looks: bool = False,
 ) -> tuple[Setup, TrainState]:
     checkpoint = load_latest(folder)
-    # Read the file after the checkpoint, because a run with a time budget only adds settings to it.
+    # Read this file after the checkpoint, because a run with a time budget only adds settings to
+    # the file.
     config = _config(folder, settings)
     config_now = without_missing(config) if looks else config
     setup, seconds = set_up(config_now, verbosity, check, looks=looks)
@@ -526,7 +530,7 @@ def _config(folder: Path, settings: Mapping[str, Any]) -> RunConfig:
         )
     stored = read_config(folder)
     stored.pop("stop_after", None)
-    # Runs write the initial degree; runs of the first versions started with degree 0.
+    # Runs write the initial degree. Runs of the first versions started with degree 0.
     stored["sh_from"] = stored.get("sh_from") or 0
     try:
         config = parsed({**stored, **settings})

@@ -12,7 +12,7 @@ from pydantic.fields import FieldInfo
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.flags import Flag
 
-#: Types that an option keeps; every other value is read as text and validated by the schema.
+#: Types that an option keeps. Every other value is read as text and validated by the schema.
 _OWN_TYPES: Final = (int, float, Path)
 
 

@@ -32,7 +32,7 @@ from crossgrad_core.training.per_image_params import PHOTO_VALUES, write_photos
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 
-#: The trained scene, for viewers; the exporter gives the suffix.
+#: Name of the file with the trained scene, for viewers. The exporter adds the suffix.
 CLOUD = "point_cloud"
 #: Number of held-out views for which panels are rendered.
 PANELS = 4

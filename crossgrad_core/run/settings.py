@@ -39,7 +39,8 @@ LENGTHS: Final = tuple(
         *("planned_seconds", "planned_views"),
     )
 )
-#: Other settings on which a recipe's decisions depend; if one changes, the recipe decides again.
+#: Other settings on which a recipe's decisions depend. If one of these settings changes, the recipe
+#: decides again.
 _DECIDING: Final = ("recipe", "backbone", "densifier", "operator", "sampler", "views_per_step")
 #: Settings that contain settings.
 GROUPS_OF_SETTINGS: Final = ("data",)

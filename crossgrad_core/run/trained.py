@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from crossgrad_core.training.setup import Setup
     from crossgrad_core.training.state import TrainState
 
-#: Column name -> [E] numbers, integers if all of them are.
+#: Column name -> [E] numbers, which are integers if all numbers of the column are integers.
 Columns: TypeAlias = dict[str, NDArray[np.float64] | NDArray[np.int64]]
 
 

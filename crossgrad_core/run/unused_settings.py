@@ -102,7 +102,7 @@ def _of_density_control(config: RunConfig, setup: Setup) -> Iterator[tuple[str, 
             yield setting, f"densifier {name} makes no edits"
     if config.growth == "budget" and not densifier.edits:
         yield "growth", f"densifier {name} makes no edits"
-    # A number also limits the initial points.
+    # If `max_gaussians` is a number, it also limits the initial points.
     if not densifier.edits and config.max_gaussians == AUTO:
         yield (
             "max_gaussians",

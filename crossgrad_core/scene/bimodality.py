@@ -7,12 +7,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-#: The coefficient of a uniform sample, rounded down; samples below this value have one mode.
+#: The bimodality coefficient of a uniform sample, rounded down. Samples below this value have one
+#: mode.
 ONE_MODE: Final = 0.555
-#: Smallest sample with a finite-sample kurtosis.
+#: Smallest sample for which the finite-sample kurtosis is defined.
 _SMALLEST = 4
-#: Minimum sample size: in smaller samples, two equal points stay below the uniform value in the
-#: finite-sample form (docs/groupings.md).
+#: Minimum sample size. In a smaller sample with values at only two points, the finite-sample
+#: coefficient stays below the value of a uniform sample (docs/groupings.md).
 _SMALLEST_SAMPLE = 10
 
 
@@ -54,7 +55,7 @@ def bimodality(values: NDArray[np.float64]) -> Bimodality:
         return Bimodality(float("nan"), float("nan"), size, reason)
     deviations = values - values.mean()
     spread = float(np.abs(deviations).max())
-    # If all values are equal, rounding of the mean leaves deviations of the rounding error's size.
+    # If all values are equal, the deviations can still be non-zero, because the mean is rounded.
     if spread <= 4.0 * np.finfo(np.float64).eps * float(np.abs(values).max()):
         return Bimodality(float("nan"), float("nan"), size, "all values are equal")
     scaled = deviations / spread

@@ -89,7 +89,8 @@ class Calibration:
                 found=str(len(self.params)),
                 todo=_AGAIN,
             )
-        if not all(abs(value) <= _LARGEST_PARAMETER for value in self.params):  # also False for NaN
+        # This is also False for NaN.
+        if not all(abs(value) <= _LARGEST_PARAMETER for value in self.params):
             raise UserError(
                 "a camera parameter is not a finite number",
                 where=where,
@@ -207,7 +208,7 @@ class Calibration:
         import pycolmap
 
         options = pycolmap.UndistortCameraOptions()
-        # This also refuses models without a pinhole equivalent, before `_reach` is computed.
+        # This call also refuses models without a pinhole equivalent, before `_reach` is computed.
         smallest = self._undistorted(options).width <= options.min_scale * self.width
         if smallest and (self._reach.folds or self._reach.wide):
             options.min_scale = 1.0

@@ -21,11 +21,12 @@ from crossgrad_core.scene.photos.photos import FilePhoto
 from crossgrad_core.scene.split import TEST_LIST, TRAIN_LIST
 from crossgrad_core.scene.wording import name_some
 
-#: Version of the layout; raised whenever an older reader could misread a newer fingerprint.
+#: Version of the layout. It is raised if an older reader could misread a newer fingerprint.
 FORMAT: Final = 1
-#: Bytes of a file that are read at its start and at its end.
+#: Number of bytes of a file that are read at its start and at its end.
 END = 64 * 2**10
-#: Decimals stored for pixels and local units: far more than needed to distinguish cameras.
+#: Number of decimals that are stored for pixels and local units. This is far more precise than
+#: needed to distinguish cameras.
 DECIMALS = 6
 # Libraries on another machine may round the last digits differently.
 _TOLERANCE = 10.0 ** (1 - DECIMALS)
@@ -152,7 +153,7 @@ def mark_of(path: Path) -> FileMark:
             file.seek(max(END, size - END))
             digest.update(file.read(END))
             file.seek(0)
-            # The two ends cover a small file completely.
+            # For a small file, both ends together contain the complete file.
             whole = file_digest(file, "sha256").hexdigest() if size > 2 * END else None
     except OSError as error:
         raise UserError(
@@ -166,7 +167,8 @@ def mark_of(path: Path) -> FileMark:
 
 def _files_of(view: View) -> tuple[FileMark | None, FileMark | None]:
     photo = view.photo
-    if not isinstance(photo, FilePhoto):  # Photos of plugins may come from any source.
+    # Photos of plugins may come from other sources than files.
+    if not isinstance(photo, FilePhoto):
         return None, None
     mask = photo.source.mask
     return mark_of(photo.source.path), None if mask is None else mark_of(mask)
@@ -192,11 +194,12 @@ def _points_of(scene: Scene) -> PointsMark:
 class Weight(IntEnum):
     """The effect of a difference on a model that was trained on the former scene."""
 
-    #: Only pixels or points differ; all cameras and parameters are unchanged.
+    #: Only pixels or points differ. All cameras and parameters are unchanged.
     CONTENT = 1
-    #: Other views are held out.
+    #: Other views are held out than before.
     HELD_OUT = 2
-    #: Other views are trained, or cameras moved, so the parameters would be misplaced.
+    #: Other views are trained than before, or cameras moved. The trained parameters would be at
+    #: wrong positions.
     PLACE = 3
 
 
@@ -223,7 +226,7 @@ def differences(was: Fingerprint, now: Fingerprint) -> list[Difference]:
     if not any(change.weight is Weight.PLACE for change in changes):
         changes += _frame(was, now) or [*_cameras(was, now), *_points(was, now)]
     changes += _files(was, now)
-    # If a difference was found, it is listed, and other changed files are not reported in addition.
+    # Report other changed files only if no difference was found so far.
     return changes or _others(was, now)
 
 

@@ -7,11 +7,12 @@ from numpy.typing import NDArray
 
 from crossgrad_core.contract.scene import Similarity, stray_rows
 
-# 1.1 x the largest distance of a training camera from the mean of all (3DGS, scene extent).
+# The scene extent is this factor times the largest distance between a training camera and the mean
+# of all training cameras (3DGS).
 _MARGIN = 1.1
 
-# If the distance between cameras is below this share of their distance to the scene, it is not used
-# as the unit.
+# If the distance between cameras is below this share of their distance to the scene, the distance
+# between cameras is not used as the unit.
 _SAME_PLACE = 1e-6
 
 # A smaller size, in input units, is treated as 0, because its inverse must be finite.
@@ -19,8 +20,9 @@ _SMALLEST = 1e-30
 
 # Local coordinates are rounded to multiples of this, 1e-9 of the extent. If the same scene is given
 # in other units or with another origin, float64 results differ by a few units in the last place.
-# This difference is 1e3 to 1e7 times smaller than the grid, so nearly all coordinates are equal
-# after rounding. The rounding error is 60 times smaller than the step of float32 at 1.
+# This difference is 1e3 to 1e7 times smaller than the rounding step, so nearly all coordinates are
+# equal after rounding. The rounding error is 60 times smaller than the spacing of float32 numbers
+# near 1.
 _GRID = 2.0**-30
 
 
@@ -69,7 +71,7 @@ def make_frame(centers: NDArray[np.float64], points: NDArray[np.float64]) -> Fra
     """
     stray = stray_rows(centers, points)
     centers = centers[~stray]
-    # Sums of coordinates far from 0 lose digits; sums of differences do not.
+    # A sum of coordinates far from 0 loses digits; a sum of coordinate differences does not.
     origin = centers[0] + (centers - centers[0]).mean(0)
     extent = float(_MARGIN * np.linalg.norm(centers - origin, axis=1).max())
     depth = float(np.median(np.linalg.norm(points - origin, axis=1))) if len(points) else 0.0

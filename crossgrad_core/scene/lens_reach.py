@@ -12,13 +12,15 @@ from crossgrad_core.contract.scene import Pinhole
 if TYPE_CHECKING:
     import pycolmap
 
-#: Directions around the axis, and steps along each direction, for a coarse and for a fine scan.
+#: Number of directions around the axis, and number of steps along each direction, for a coarse and
+#: for a fine scan.
 _FIRST, _CLOSER = (72, 128), (180, 360)
 #: The largest scanned angle from the axis: a pinhole camera ends at 90 degrees.
 _WIDEST: Final = np.deg2rad(89.5)
 #: The last pixel before the fold is spread over many undistorted pixels, so it is ignored.
 _RIM: Final = 1.0
-#: Cells along each side of a frame for the sum of areas, and rows that are masked at a time.
+#: Number of cells along each side of a frame for the sum of areas, and number of rows that are
+#: masked at a time.
 _CELLS, _ROWS = 64, 256
 #: Degree of the polynomial that extrapolates the radius beyond 90 degrees.
 _DEGREE: Final = 13

@@ -29,7 +29,7 @@ SUFFIXES: Final = (".las", ".laz")
 #: Suffixes of all point clouds.
 CLOUDS: Final = (".ply", *SUFFIXES)
 _GREY: Final = 127
-#: Colours have 16 bits if this percentile is at least `_LONG`.
+#: If this percentile of the colours is at least `_LONG`, the colours have 16 bits.
 _MOST: Final = 99.0
 _LONG: Final = 512.0
 _COLORS: Final = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
@@ -37,19 +37,20 @@ _COLORS: Final = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "di
 _GAUSSIAN: Final = frozenset({"f_dc_0", "opacity", "scale_0", "rot_0"})
 _RGB: Final = ("red", "green", "blue")
 _AT_ONCE: Final = 1_000_000
-#: Maximum number of points that are read from a file; from a larger file, only every n-th point is
+#: Maximum number of points that are read from a file. From a larger file, only every n-th point is
 #: read.
 _MOST_IN_LAS: Final = 20_000_000
 #: Number of points that are kept by default: FEWEST, or PER_PHOTO for each photo if that is more.
 #: Structure from motion finds a few hundred points per photo.
 FEWEST: Final = 100_000
 PER_PHOTO: Final = 1_000
-#: Maximum number of cube sizes that are tried. The search ends early at this share of the wanted
-#: points.
+#: Maximum number of cube sizes that are tried. The search ends early when it keeps at least this
+#: share of the wanted number of points.
 _TRIES, _ENOUGH = 12, 0.8
 #: Number of sampled points from which the size of a cloud is estimated.
 _SAMPLED: Final = 100_000
-#: Points are on surfaces, so the number of occupied cubes falls with the square of the side.
+#: Points are on surfaces, so the number of occupied cubes is inversely proportional to the square
+#: of the side.
 _SURFACE: Final = 2.0
 #: Odd factors that hash the integer coordinates of a cube.
 _FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)
@@ -102,7 +103,8 @@ def read_cloud(path: Path, source: str) -> PointCloud:
             found=f"no {', '.join(missing)}",
             todo="export the points again",
         )
-    with np.errstate(invalid="ignore"):  # signalling NaN; these points are left out with a note
+    # A signalling NaN causes this warning. The points are left out with a note
+    with np.errstate(invalid="ignore"):
         positions = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64)
     return PointCloud(
         positions, _colors(columns, len(positions)), source, gaussians=columns.keys() >= _GAUSSIAN
@@ -119,8 +121,8 @@ def _colors(columns: Mapping[str, NDArray[np.generic]], count: int) -> NDArray[n
         return stored
     with np.errstate(invalid="ignore"):
         values = np.nan_to_num(stored.astype(np.float64))
-    # Text files store no types: values above 1 are integers, and values far above 255 are 16-bit
-    # integers, as scanners write them.
+    # Text files do not store types. If values are above 1, they are integers. If values are far
+    # above 255, they are 16-bit integers, as scanners write them.
     sizes = np.abs(values[np.isfinite(stored)])
     long = len(sizes) > 0 and np.percentile(sizes, _MOST) >= _LONG
     top = 1.0 if sizes.max(initial=0.0) <= 1.0 else 65_535.0 if long else 255.0
@@ -140,7 +142,7 @@ def read_las(path: Path) -> dict[str, NDArray[np.generic]]:
         with open_file(path) as file, laspy.open(file) as reader:
             rows = list(_rows(reader))
             expected, names = reader.header.point_count, _names(reader)
-    # Damaged files raise any error of numpy, struct or the decompressor.
+    # A damaged file can raise any error of numpy, struct or the decompressor.
     except Exception as error:
         raise UserError(
             "the point cloud cannot be read",

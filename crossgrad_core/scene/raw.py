@@ -15,14 +15,17 @@ from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.frame import Frame, camera_centers
 from crossgrad_core.scene.wording import count, name_some
 
-#: Larger coordinates, in input units, are invalid: their squares must stay within float64.
+#: Coordinates larger than this, in input units, are invalid, because their squares must stay within
+#: float64.
 FARTHEST = 1e30
-#: Largest coordinate in local units: its square must stay within float32.
+#: Largest coordinate in local units. Its square must stay within float32.
 FARTHEST_LOCAL = 1e15
-#: Bytes of a file or folder name, and of a whole path, allowed on every usual file system.
+#: Largest number of bytes of a file or folder name, and of a whole path, that usual file systems
+#: allow.
 LONGEST_PART, LONGEST_NAME = 255, 1024
-_NO_SIGNS = {"Cc", "Cs"}  # control characters, and bytes that are not UTF-8
-# Rotations written with six digits pass; a pose that contains a scale fails.
+_NO_SIGNS = {"Cc", "Cs"}  # Control characters, and bytes that are not UTF-8
+# Tolerance of the test for rigid rotations. Rotations written with six digits pass, and a pose that
+# contains a scale fails.
 _RIGID = 1e-4
 
 

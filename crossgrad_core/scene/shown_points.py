@@ -6,7 +6,7 @@ import numpy as np
 
 from crossgrad_core.contract.scene import Scene, is_in_image
 
-#: Sampled points, spread over all points.
+#: Number of points that are sampled from the whole cloud.
 _POINTS: Final = 1000
 
 

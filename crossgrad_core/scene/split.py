@@ -19,9 +19,9 @@ TEST_LIST = "test_list.txt"
 #: median of the training views is the threshold.
 Label: TypeAlias = Callable[[Sequence[str]], Mapping[str, str]]
 
-_LINES: Final = {b"\n": 150}  # bytes of a name in memory
+_LINES: Final = {b"\n": 150}  # number of bytes of a name in memory
 
-#: A mean over fewer held-out views does not describe a regime.
+#: A mean over fewer held-out views than this does not describe a regime.
 _FEWEST: Final = 2
 
 
@@ -133,7 +133,7 @@ def _split_by_lists(
     root: Path,
     how: str,
 ) -> Split:
-    # No list file contains a split that the input prescribes.
+    # A split that the input prescribes does not come from list files.
     places = [root / file if how == "by lists" else root for file in (TRAIN_LIST, TEST_LIST)]
     both = sorted(listed[0] & listed[1])
     if both:

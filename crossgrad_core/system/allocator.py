@@ -10,15 +10,17 @@ from typing import Any, Final
 TRIM_THRESHOLD: Final = -1
 TOP_PAD: Final = -2
 MMAP_THRESHOLD: Final = -3
-#: Bytes of freed memory that are kept, and size of the largest array on the heap (the upper bound
-#: of glibc).
+#: Number of bytes of freed memory that are kept, and size of the largest array on the heap (the
+#: upper bound of glibc).
 KEPT: Final = 512 << 20
 LARGEST: Final = 32 << 20
-#: Bytes by which the heap grows at first, and later. The first growth is small, so that it is not
-#: returned at once. The heaps of other threads are returned only in pieces of the later size.
+#: Number of bytes by which the heap grows at first, and number of bytes by which it grows later.
+#: The first growth is small, so that it is not returned to the system at once. The heaps of other
+#: threads are returned to the system only in pieces of the later size.
 FIRST: Final = KEPT - 2 * LARGEST
 LATER: Final = 16 << 20
-#: Size of a large page in bytes, and the advice constant, which older headers may lack.
+#: Size of a large page in bytes, and the `madvise` constant for large pages, which older headers
+#: may lack.
 LARGE_PAGE: Final = 2 << 20
 _HUGE: Final[int] = getattr(mmap, "MADV_HUGEPAGE", 14)
 

@@ -15,7 +15,8 @@ from crossgrad_core.system.files import (
     unfinished_name,
 )
 
-#: Maximum number of bytes that the path of a file below a folder of results adds.
+#: Maximum number of bytes that the path of a file inside a folder of results adds to the folder's
+#: path.
 _BELOW: Final = 200
 
 
@@ -41,10 +42,10 @@ def check_folder(folder: Path, needed: int = 0) -> None:
             todo="choose another path, or remove the file",
         )
     try:
-        # Permission bits are not reliable on network file systems; a test file is.
+        # Write a test file, because permission bits are not reliable on network file systems.
         with disk_errors(folder), tempfile.TemporaryFile(dir=existing) as probe:
             probe.write(b"crossgrad")
-    except OSError as error:  # A special kind of error, as in /proc.
+    except OSError as error:  # Some file systems, such as /proc, raise a special kind of error.
         raise read_only(folder) from error
     if needed and free_bytes(existing) < needed:
         raise disk_full(folder, needed)

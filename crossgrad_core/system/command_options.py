@@ -21,14 +21,14 @@ _Given = TypeVar("_Given")
 _INFO = "option of the command line"
 
 
-def argument(metavar: str, help: str, default: Any = MISSING) -> Any:  # noqa: A002, ANN401 - typer's
+def argument(metavar: str, help: str, default: Any = MISSING) -> Any:  # noqa: A002, ANN401 - the signature is typer's
     """Return a dataclass field for an argument of the command, required if it has no default."""
     info = typer.Argument(metavar=metavar, help=help, show_default=False)
     return field(default=default, metadata={_INFO: info})
 
 
 def option(
-    default: Any,  # noqa: ANN401 - the type is the field's
+    default: Any,  # noqa: ANN401 - the type is the type of the field
     help: str,  # noqa: A002 - typer's name
     metavar: str | None = None,
     *,

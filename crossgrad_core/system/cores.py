@@ -60,5 +60,5 @@ def _sched_getcpu() -> Callable[[], int] | None:
         return None
     import ctypes
 
-    # PyDLL keeps Python's lock: the call is faster than releasing the lock.
+    # `PyDLL` keeps Python's lock, because this call is faster than releasing the lock.
     return getattr(ctypes.PyDLL(None), "sched_getcpu", None)

@@ -153,7 +153,8 @@ def clear_leftovers(folder: Path, *, shared: bool = False) -> None:
 
 def _is_alive(process: int) -> bool:
     """Return True if another process of this machine has that number."""
-    # An earlier process with the same number left it, as in a container.
+    # An earlier process with the same number wrote the file. Process numbers repeat in a container,
+    # for example.
     if process == os.getpid():
         return False
     try:

@@ -12,10 +12,11 @@ from typing import Final
 
 from crossgrad_core.system.files import size_text
 
-#: Most bytes of a file that is parsed as a whole. Its values may take `GROWS` times as much memory.
+#: Maximum number of bytes of a file that is parsed as a whole. The parsed values may take `GROWS`
+#: times as much memory.
 LARGEST: Final = 64 << 20
 GROWS: Final = 8
-#: Bytes per character of Python's widest strings.
+#: Number of bytes per character of Python's widest strings.
 _WIDEST: Final = 4
 
 

@@ -15,11 +15,11 @@ from types import FrameType
 SIGNALS = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 )
-#: Lines that tell the user how to continue after an immediate end, the newest last.
+#: Lines that tell the user how to continue after an immediate end. The newest line is last.
 _WAYS_ON: list[str] = []
-#: Files that are being written; they are deleted if the process ends immediately.
+#: Files that are being written. They are deleted if the process ends immediately.
 UNFINISHED: set[str] = set()
-#: Numbers of the processes that write such files; they are ended first.
+#: Numbers of the processes that write unfinished files. These processes are ended first.
 HELPERS: set[int] = set()
 
 
@@ -44,7 +44,7 @@ def tell(text: str, *, alone: bool = True) -> None:
     try:
         sys.stderr.write(line)
         sys.stderr.flush()
-    except RuntimeError:  # The signal came while another message was written to stderr.
+    except RuntimeError:  # The signal arrived while another message was being written to stderr.
         with suppress(OSError):
             os.write(2, line.encode(errors="backslashreplace"))
     except (OSError, ValueError):
@@ -87,6 +87,6 @@ def ended_quietly() -> Iterator[None]:
     try:
         yield
     finally:
-        # The process is about to exit; Python's own handler would print a traceback.
+        # The process is about to exit, and Python's own handler would print a traceback.
         for number in numbers:
             signal.signal(number, signal.SIG_DFL)

@@ -36,7 +36,8 @@ _TYPES = {
     "float64": "f8",
 }
 _FORMATS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
-# Not `isdigit`, which accepts digits of other scripts; and no file holds 10^18 records.
+# `isdigit` would also accept digits of other scripts. More than 18 digits are refused, because no
+# file contains 10^18 records.
 _COUNT = re.compile(r"[0-9]{1,18}")
 _LONGEST_HEADER_LINE = 65_536
 _MOST_HEADER_LINES = 10_000

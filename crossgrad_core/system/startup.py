@@ -18,7 +18,8 @@ from crossgrad_core.wording import one_line
 
 #: The logger of the kernel cache.
 KERNELS: Final = "crossgrad_core.numerics.kernel_cache"
-#: Seconds between lines about compiling, for a stderr that is not a terminal and for a terminal.
+#: Seconds between messages about compilation: first for output that is not a terminal, then for a
+#: terminal.
 PLAIN_INTERVAL, TERMINAL_INTERVAL = 60.0, 1.0
 _PACKAGE = "crossgrad_core"
 _EXPLANATION = "compiling for this machine, only before the first start (about a minute)"
@@ -137,7 +138,7 @@ def _say(text: str, *, stays: bool = True) -> None:
         stream.write(f"{clear}{one_line(text)}" + ("\n" if stays else ""))
         stream.flush()
     except (OSError, ValueError):
-        pass  # Nobody reads the output any more.
+        pass  # The reader of the output has closed it.
 
 
 class Progress:

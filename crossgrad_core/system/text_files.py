@@ -15,8 +15,8 @@ from crossgrad_core.system.input_files import LARGEST, read_file
 # `int` and `float` also accept digits of other scripts, digit groups and spaces.
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?inf|nan", re.ASCII)
 _LONGEST_NUMBER = 400
-# Bytes in memory of a list, a cell, an object with one member, and a value with its position or
-# key.
+# Number of bytes in memory of a list, of a cell, of an object with one member, and of a value with
+# its position or key.
 _CSV = {b"\n": 160, b"\r": 160, b",": 60}
 _JSON = {b"[": 96, b"{": 240, b",": 64, b":": 64}
 
@@ -103,7 +103,7 @@ def table_bytes(rows: Sequence[Mapping[str, str | int | float]]) -> bytes:
 def csv_bytes(lines: Iterable[Iterable[str]]) -> bytes:
     """Return lines of cells as in a file: UTF-8, commas, a line feed after each line."""
     rows = _Rows()
-    # With this line end, cells that contain one of its two characters are quoted.
+    # With this line end, the writer quotes cells that contain a carriage return or a line feed.
     csv.writer(rows, lineterminator="\r\n").writerows(lines)
     return text_bytes("".join(row.removesuffix("\r\n") + "\n" for row in rows))
 

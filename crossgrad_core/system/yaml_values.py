@@ -20,8 +20,8 @@ from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from crossgrad_core.errors import UserError
 from crossgrad_core.system.input_files import open_file
 
-#: Limits of a text: bytes, values (an alias counts as often as the value that it copies), nesting
-#: depth of lists, digits of a number.
+#: Limits of a YAML text: bytes, number of values (an alias counts as often as the value that it
+#: copies), and nesting depth of lists. The last limit is the number of digits of a number.
 MOST_BYTES: Final = 1 << 18
 MOST_VALUES: Final = 10_000
 DEEPEST: Final = 32
@@ -104,7 +104,7 @@ def read_yaml(text: str) -> object:
         node = loader.get_single_node()
         return None if node is None else _Values().of(node, 0)
     except (ValueError, OverflowError) as error:
-        # PyYAML raises these for escapes beyond Unicode and for endless version numbers.
+        # PyYAML raises these errors for escapes beyond Unicode and for extremely large numbers.
         raise yaml.YAMLError(f"an escape sequence or number is not valid ({error})") from error
     finally:
         loader.dispose()
@@ -209,7 +209,7 @@ def _integer(text: str) -> int:
 
 
 def _float(text: str) -> float:
-    # Python writes `.inf` as `inf`.
+    # YAML's `.inf` is `inf` in Python.
     value = float(text.replace(".", "", 1) if text.lower().endswith((".inf", ".nan")) else text)
     if isnan(value):
         raise ValueError("a value is NaN, which no setting can be")

@@ -29,10 +29,11 @@ from crossgrad_core.wording import listed
 
 #: Steps at which decoding is checked: before the first step, early, and at the end.
 _STEPS = (0, 1, 30_000)
-#: Largest change of parameters from their initial values.
+#: Maximum change of parameters from their initial values.
 _STEP = 0.02
-#: Largest and mean difference of two renders whose float32 values were computed in two ways. A few
-#: Gaussians then appear in or disappear from a pixel at their edge, where alpha is 1/255.
+#: Maximum difference and mean difference of two renders whose float32 values were computed in
+#: different ways. A few Gaussians then appear in or disappear from a pixel at their edge, where
+#: alpha is 1/255.
 _PIXEL, _MEAN = 0.02, 2e-4
 
 
@@ -199,7 +200,8 @@ def edits_keep_rows_together(make: Make[Backbone]) -> None:
     backbone = make()
     before = created(backbone)
     rows = primitives_of(backbone.blocks(), before)
-    # Drops the last two primitives, repeats the first two at the end, and reverses the rest.
+    # Drop the last two primitives, repeat the first two at the end, and reverse the remaining
+    # primitives.
     source = torch.cat([torch.arange(rows - 3, -1, -1), torch.tensor([0, 1])])
     after = _edited(backbone, before, source)
     for block in backbone.blocks():

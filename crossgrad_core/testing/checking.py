@@ -52,7 +52,7 @@ def check_entry(entry: registry.Entry) -> list[Result]:
         else []
     )
     if taken and entry.slot == COMMANDS:
-        return names  # The command can never be called.
+        return names  # The command cannot be called at all.
     try:
         loaded = load_command(entry) if entry.slot == COMMANDS else registry.load_entry(entry)
     except UserError as error:

@@ -163,7 +163,7 @@ def _directions(radii: Tensor, gradient: Tensor, rng: np.random.Generator) -> Te
     """Make up to four pixels in each bin; their absolute gradients sum to twice `gradient`."""
     shape = (radii.shape[0], 6, 4)
     angles = torch.from_numpy(rng.uniform(0.0, 2.0 * np.pi, shape)).float()
-    there = torch.from_numpy(rng.random(shape) < 0.5).float()  # noqa: PLR2004 - every other one
+    there = torch.from_numpy(rng.random(shape) < 0.5).float()  # noqa: PLR2004 - each value is 1 with probability one half
     there *= (radii > 0)[:, None, None]
     units = torch.stack([angles.cos(), angles.sin(), there], -1) * there[..., None]
     sums = units.sum(2)
@@ -174,7 +174,8 @@ def _directions(radii: Tensor, gradient: Tensor, rng: np.random.Generator) -> Te
 def _backbone_for(densifier: Densifier) -> Backbone:
     """Return a backbone that uses this densifier by default, or that has the tensors it edits."""
     fitting = []
-    # Of several suitable backbones, use the first one, which is crossgrad's own.
+    # If several backbones are suitable, use the first backbone. Crossgrad's own backbones come
+    # first.
     candidates = sorted(
         entries("backbones").values(), key=lambda entry: entry.distribution != "crossgrad"
     )
@@ -184,7 +185,7 @@ def _backbone_for(densifier: Densifier) -> Backbone:
             have = {tensor for block in backbone.blocks() for tensor in block.tensors}
             default = load("densifiers", backbone.default_densifier)
         except (Exception, SystemExit):
-            # If a backbone of another package is broken, the densifier is not the cause.
+            # If a backbone of another package is broken, this is not an error of the densifier.
             continue
         if densifier.tensors <= have:
             fitting.append((type(densifier) is not default, backbone))

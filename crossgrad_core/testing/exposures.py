@@ -11,7 +11,7 @@ from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.testing.support.components import COMPONENT_CHECKS
 from crossgrad_core.testing.support.contract import Check, Make, cannot_tell, require
 
-#: Largest change by a second projection.
+#: Largest difference between an exposure that is projected once and one that is projected twice.
 _ROUNDING = 1e-5
 
 

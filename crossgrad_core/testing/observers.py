@@ -74,11 +74,11 @@ from crossgrad_core.testing.support.renders import (
 )
 from crossgrad_core.wording import in_one_line
 
-#: The hooks of one run's manager; pluggy gives them no types.
+#: The hooks of one run's manager. pluggy gives them no types.
 Hooks: TypeAlias = Any
 
 _VIEWS = (0, 4)
-#: Steps of the checks: the first steps, then sparser steps up to a whole run.
+#: Steps of the checks: all of the first steps, then fewer and fewer steps up to the end of a run.
 _STEPS = (*range(1, 17), 50, 100, 500, 600, 1_000, 7_000, 15_000, STEPS)
 
 
@@ -92,9 +92,11 @@ _ON_THE_CLOCK = {
     "crossgrad_densify",
     "crossgrad_after_step",
 }
-#: Number of calls, and the time limit of the fastest call: a busy machine slows only some calls.
+#: Number of calls, and time limit for the fastest call. The fastest call counts, because a busy
+#: machine slows only some calls.
 _CALLS, _SLOW = 6, 0.1
-#: Bytes that an observer may keep per step, and steps between two measurements of the memory.
+#: Number of bytes that an observer may keep per step, and number of steps between two measurements
+#: of the memory.
 _KEPT, _BLOCK = 100_000, 4
 
 
@@ -407,7 +409,7 @@ def nothing_piles_up(make: Make[Observer]) -> None:
             hooks.crossgrad_model_ready(model=model)
             if step % _BLOCK == 0:
                 kept.append(memory())
-    # Ignore the first steps, in which the observer allocates memory that it reuses, such as a
+    # Ignore the first steps, because the observer then allocates memory that it reuses, such as a
     # buffer.
     grown = min(later - earlier for earlier, later in pairwise(kept[1:])) / _BLOCK
     require(

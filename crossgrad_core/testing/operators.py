@@ -36,7 +36,7 @@ _STEPS = 4
 #: A power of two, so that scaled gradients have exactly scaled Gramians.
 _SCALE = 64.0
 _TOLERANCE = 1e-6
-#: Relative difference of two solutions of one problem by iterative solvers.
+#: Relative difference between two solutions of the same problem by iterative solvers.
 _SOLVED = 1e-3
 
 
@@ -238,7 +238,8 @@ def scales_with_the_gradients(make: Make[Operator]) -> None:
         again = transformed(operator, scaled)[0].sum(axis=1)
         lengths = np.sqrt(np.einsum("bkk->bk", case.gramians))
         for family, one, other, length in zip(case.families, weights, again, lengths, strict=True):
-            # The error is relative to the longest summand, because rounding errors are.
+            # The error is divided by the length of the longest summand, because rounding errors are
+            # proportional to it.
             error = np.abs((one - other) * length).max()
             size = np.abs(one * length).max()
             require(

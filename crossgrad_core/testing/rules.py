@@ -29,8 +29,8 @@ from crossgrad_core.training.start import first_state
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.step import final_edits
 
-#: Number of steps of a run, and the step after which it stops. Averages and learning-rate tails are
-#: active by then.
+#: Number of steps of a run, and the step after which it stops. Weight averages and learning-rate
+#: tails are active by then.
 _STEPS, _STOP = 8, 6
 
 

@@ -23,10 +23,10 @@ from crossgrad_core.testing.support.contract import (
 )
 from crossgrad_core.testing.support.growth import require_bounded, size_of
 
-#: Steps before a run is interrupted, and steps after it.
+#: Number of steps before a run is interrupted, and number of steps after the interruption.
 _BEFORE, _AFTER = 7, 12
 #: Number of steps within which every training view must be drawn. For uniform draws of one view of
-#: nine, the probability of missing one is 9 (8/9)^400 < 1e-19.
+#: nine, the probability of missing a view is below 9 (8/9)^400 < 1e-19.
 _PATIENCE = 400
 
 
@@ -60,7 +60,7 @@ def draws_are_training_views(make: Make[Sampler]) -> None:
     for views in admitted(sampler.view_counts):
         run = sampler_run(sampler, views)
         for _ in range(_AFTER):
-            # This check comes before the run, because the run requires a valid sample.
+            # Check the sample before the step, because the step requires a valid sample.
             draw, _ = sampler.sample(run.context(), run.state)
             _require_good(draw, sampler.counts(views), len(run.scene.train))
             run.draw()

@@ -16,8 +16,9 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, unwatched
 from crossgrad_core.training.state import ClockKind, TrainState
 
-#: Increase of the mean cost of a step per density control edit, in units of a step at the start.
-#: The value comes from runs with four edits; during a run, time measurements correct it.
+#: Each density control edit increases the mean cost of a step by this share of the cost of a step
+#: at the start. The value comes from runs with four edits. During a run, time measurements correct
+#: the cost.
 COST_PER_EDIT = 0.2
 #: Maximum number of edits that are counted, because growth slows down.
 COUNTED_EDITS = 5
@@ -78,8 +79,9 @@ def growth_ahead(setup: Setup, crowd: PrimitiveCounts, schedule: Schedule, step:
         return 1.0
     ahead = schedule.edits(step)
     if ahead and setup.numbers.growth == "budget":
-        # The limit is needed for time budgets that no run uses up, for example near the published
-        # length.
+        # Some primitive budgets are larger than the number of primitives that any run reaches, for
+        # example near the published length. Without the limit, the cost of these runs would be
+        # overestimated.
         return min(1.0 + COST_PER_EDIT * COUNTED_EDITS, _along_curve(setup, crowd, schedule, step))
     done = schedule.edits_before + schedule.edits() - ahead
     return 1.0 + COST_PER_EDIT * min(ahead, max(0, COUNTED_EDITS - done))
@@ -99,17 +101,19 @@ def _along_curve(setup: Setup, crowd: PrimitiveCounts, schedule: Schedule, step:
 
 
 _LOG = logging.getLogger(__name__)
-#: Minimum number of steps of the probe, and between two readings of the clock.
+#: Minimum number of steps of the timing probe, and minimum number of steps between two readings of
+#: the clock.
 PROBE_STEPS = 12
 #: Minimum share of the time budget that the probe uses.
 PROBE_SHARE = 0.01
-#: How often the probe restarts after the compilation of a kernel.
+#: Maximum number of restarts of the timing probe after the compilation of a kernel.
 _TRIES = 8
-#: Share of the budget between two readings of the clock.
+#: Share of the time budget between two readings of the clock.
 LOOK_SHARE = 0.02
 #: The length changes only if the difference is larger than this share of the remaining steps.
 TOLERANCE = 0.02
-#: A step that no run reaches, and an earlier step after which photos have their full size.
+#: A step number that no run reaches, and an earlier step number after which photos have their full
+#: size.
 _NEVER = 10**9
 _FULL_SIZE = _NEVER - _NEVER // 100
 #: Weight of the newest measurement in the smoothed cost of a step. Smoothing is needed because
@@ -139,12 +143,14 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
             lambda steps: cost_of_run(measured, crowd, steps), seconds / seconds_per_step
         )
 
-    # The number of pixels in the first steps may depend on the length.
+    # A change of the length may change the number of pixels in the first steps.
     fits = fitting(share)
     first = _without_edits(schedule_for(setup, fits), max(fits, 2 * PROBE_STEPS))
     pixels = setup.selection.resolution.pixels(first, PROBE_STEPS) / first.pace.views(PROBE_STEPS)
     if pixels < 1.0:
-        del state  # Its resolution state stores the scale that the views have reached.
+        # Delete this state, because its resolution state stores the scale that the views have
+        # reached.
+        del state
         state = first_state(unwatched(setup))
         steps, small = _probed(replace(probed, schedule=first), state, seconds)
         note += f" at full size, {steps} at first {small * first.pace.at(1) * 1000:.1f} ms"
@@ -247,7 +253,7 @@ class Timed:
     def due(self, state: TrainState) -> bool:
         """Return True after a number of steps and a share of the budget."""
         if state.rewinds > self._rewinds:
-            # A length is recorded together with its step, so each step may occur only once.
+            # A run records each new length with its step, so that each step may occur only once.
             self._rewinds, self._next = state.rewinds, self._seen + 1
             self._look(state)
         self._seen = state.step
@@ -366,7 +372,7 @@ def _fitting(cost: Callable[[int], float], affordable: float) -> int:
         affordable: Largest cost, in full-size views.
     """
     fits, too_many = 1, max(2, ceil(affordable) + 1)
-    # These views have less than full size.
+    # The views of these steps have less than full size.
     while cost(too_many) <= affordable and too_many < _NEVER:
         too_many *= 2
     while too_many - fits > 1:

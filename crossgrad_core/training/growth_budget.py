@@ -38,7 +38,7 @@ def _most(setup: Setup, state: TrainState) -> int:
 def started_with(setup: Setup, state: TrainState) -> int:
     """Return the number of primitives at the start of the run."""
     kept = state.states.get(STATE)
-    # No Gaussian is added before the first edit, so the present number is the initial number.
+    # No Gaussian has been added before the first edit, so the present number is the initial number.
     return state.primitives(setup) if kept is None else cast("int", kept.values["start"])
 
 

@@ -30,7 +30,7 @@ from crossgrad_core.training.state import (
 from crossgrad_core.training.step import model_of, sample_context, take_step
 from crossgrad_core.training.views import photo_camera
 
-#: Messages at the first and at the second signal; the third signal ends the process.
+#: Messages at the first and at the second signal. A third signal ends the process.
 _WORDS = (
     (
         "stopping: the current state is saved and evaluated first (press again to "
@@ -145,7 +145,7 @@ class Prefetcher:
             self._follow(state)
             self._draw(state)
             views = [setup.train_views[index] for draw in self._draws for index in draw]
-        except Exception:  # The step will report the error.
+        except Exception:  # The training step will report the error.
             self._blind = True
             return
         scale = max(state.last.scales, default=1.0) if state.last is not None else 1.0
@@ -185,10 +185,10 @@ class Prefetcher:
 #: Reason why the loop returned.
 Ending = Literal["finished", "stopped", "paused"]
 #: Number of steps between checks of all parameters. Losses and gradients are checked in every step.
-#: A bad parameter that affects neither, for example of a Gaussian that is no longer rendered, is
-#: found later.
+#: A bad parameter that affects neither the loss nor the gradients, for example of a Gaussian that
+#: is no longer rendered, is found later.
 CHECK_EVERY = 10
-#: Number of steps between copies of the last good state; a multiple of `CHECK_EVERY`.
+#: Number of steps between copies of the last good state. It is a multiple of `CHECK_EVERY`.
 SNAPSHOT_EVERY = 100
 
 
@@ -277,7 +277,7 @@ def _steps(
         pausing = pauses is not None and state.step < last and pauses(state)
         if pausing and _is_good(setup, state, sink, guard):
             return "paused"
-    # A signal may have arrived after the last check.
+    # A signal may have arrived after the last check of the loop.
     _is_good(setup, state, sink, guard)
     return "finished" if state.step >= total else "stopped"
 
@@ -292,7 +292,8 @@ def timed_step(setup: Setup, state: TrainState) -> StepRecord:
     setup.photos_ahead.taken_cpu()
     record = take_step(setup, state)
     if setup.config.clock == "cpu" or looks_after(setup, state.step):
-        state.late.finish()  # Count the time for this step.
+        # Finish deferred updates here, so that their time counts for this step.
+        state.late.finish()
     state.laps.leave_out(0.0, setup.photos_ahead.taken_cpu())
     state.laps.lap("other")
     state.clock.count(state.laps)
@@ -355,7 +356,8 @@ def evaluates_after(setup: Setup, step: int) -> bool:
     """Return True if held-out views are evaluated after this step; False for the last step."""
     every = setup.numbers.eval_every
     first = max(1, setup.config.eval_from)
-    # Opacities are also reset every tenth of the steps, and renders are poor right after a reset.
+    # Evaluate between opacity resets, which occur every tenth of the run, because renders are poor
+    # right after a reset.
     chosen = "eval_every" not in setup.config.decided
     between = not chosen and setup.schedule.reset_every is not None
     shift = every // 2 if between else 0

@@ -10,13 +10,15 @@ from torch import Tensor
 
 from crossgrad_core.contract.contexts import ViewRecord
 
-#: Number of copies of the parameters that always exist: parameters and two moments, in the state
-#: and in the snapshot.
+#: Number of copies of the parameters that always exist: the parameters and their two moments, once
+#: in the state and once in the snapshot.
 STANDING = 6
-#: Number of further copies during an edit, when no graph exists: the new parameters and moments.
+#: Number of additional copies of the parameters during an edit, when no autograd graph exists: the
+#: new parameters and moments.
 EDIT = 3
-#: Memory of the graph of one view until its backward pass ends, in units of the parameters or of
-#: the decoded tensors of the view, whichever is larger. Measured with the numba rasterizer: 2.7.
+#: Memory of the autograd graph of one view until its backward pass ends, in units of the parameters
+#: or of the decoded tensors of the view, whichever is larger. With the numba rasterizer, the
+#: measured value is 2.7.
 GRAPH = 3
 #: Share of the available memory that growth may claim.
 GROWTH_SHARE = 0.5
@@ -40,7 +42,8 @@ def peak_mebibytes(device: torch.device) -> float | None:
 def available_bytes(device: torch.device) -> int | None:
     """Return the bytes that can still be allocated; None if the system does not report them."""
     if device.type == "cuda":
-        # Memory that torch has reserved is not free, but new tensors can use it.
+        # Memory that torch has reserved does not count as free, but torch can use it for new
+        # tensors.
         kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
         return torch.cuda.mem_get_info(device)[0] + kept
     figures = [

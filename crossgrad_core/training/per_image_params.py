@@ -26,7 +26,7 @@ from crossgrad_core.wording import listed
 
 #: Name of the file in a run's folder.
 PHOTO_VALUES: Final = "exposure.json"
-#: Version of the format; increased when an older reader could misread a newer file.
+#: Version of the format. It is raised if an older reader could misread a newer file.
 PHOTO_VALUES_FORMAT: Final = 1
 _TODO = "give the exposure.json of a run, or leave --exposure-from out"
 
@@ -123,7 +123,7 @@ def _misfit(path: Path, exposure: object, expected: str, found: str) -> UserErro
 #: Name of this state among the states of plugins.
 STATE = "photos"
 _VALUE, _FIRST, _SECOND, _COUNT = "value", "exp_avg", "exp_avg_sq", "count"
-#: Name -> leaf [...] of one photo.
+#: Name -> leaf tensor [...] of one photo.
 Leaves = dict[str, Tensor]
 
 
@@ -244,7 +244,8 @@ def take_photo_step(
         return
     held = state.states[STATE]
     tensors = {name: tensor.clone() for name, tensor in held.tensors.items()}
-    # A checkpoint may have moved it to the GPU, where each step would wait for it.
+    # Keep the count on the CPU. A checkpoint may have moved it to the GPU, where each step would
+    # wait for it.
     tensors[_COUNT] = tensors[_COUNT].cpu()
     rates = {name: parameter.lr.at(progress) for name, parameter in setup.per_photo.items()}
     for row, gradients in _summed(taken).items():

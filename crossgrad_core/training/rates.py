@@ -9,7 +9,7 @@ from crossgrad_core.training.rules import rate_factor
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.wording import listed
 
-#: Columns of positions, of the logarithms of standard deviations, and of rotations.
+#: Number of columns of positions, of logarithms of standard deviations, and of rotations.
 _AXES: Final = (3, 3, 4)
 
 #: If a tensor learns in one of n steps, its learning rate is multiplied by n to this power.

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from crossgrad_core.contract.scene import Camera, Scene, View
 
-#: Photo [H, W, 3] uint8 and mask [H, W] bool (None if every pixel counts).
+#: Photo [H, W, 3] uint8, and its mask [H, W] bool (None if every pixel counts).
 Pair = tuple[Tensor, Tensor | None]
 #: Width and height, pixels.
 _Size = tuple[int, int]

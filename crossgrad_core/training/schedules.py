@@ -10,7 +10,7 @@ from crossgrad_core.contract.slots.densifier import Densifier
 from crossgrad_core.training.numbers import Numbers
 from crossgrad_core.training.setup import Setup
 
-#: The highest degree of harmonics.
+#: The highest degree of spherical harmonics.
 MOST_DEGREES: Final = 3
 
 #: Times of density control that the user can set.
@@ -45,7 +45,7 @@ def schedule_of(
         sh_wait=round(numbers.sh_start * length),
         **edits,
     )
-    # Settings of the user do not change with the length of the run.
+    # Settings that the user chose do not change with the length of the run.
     return replace(schedule, min_refinements=0) if edits else schedule
 
 

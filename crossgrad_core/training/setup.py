@@ -65,7 +65,7 @@ class Scale:
     def of(cls, sums: Mapping[str, float], views: int) -> "Scale":
         """Return the scale of an operator with these c(K) at K = `views`."""
         shares = {name: value / views for name, value in sums.items()}
-        # An operator that returns zero for equal gradients has no scale.
+        # An operator that returns zero for equal gradients defines no scale, so use 1.
         to_sum = {name: 1.0 / (abs(share) or 1.0) for name, share in shares.items()}
         return cls(sums, shares, to_sum)
 

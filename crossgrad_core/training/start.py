@@ -100,7 +100,8 @@ def compile_all(loss: ComponentChoice) -> None:
 def compile_rows() -> None:
     """Compile the kernels for optimizer steps of sparse rows with dummy data."""
     values, state, late = torch.zeros((8, 3)), AdamState(), Late()
-    # One row, then another row with deferred steps, then enough rows for the kernel for all rows.
+    # Train one row, then another row with deferred steps, then enough rows for the kernel that
+    # updates all rows.
     for rows in ([1], [4], [1, 4, 6]):
         grad = sparse_rows(torch.tensor(rows), torch.ones((len(rows), 3)), values.shape)
         late.step(
@@ -116,10 +117,11 @@ if __name__ == "__main__":
 _LOG = logging.getLogger(__name__)
 #: Number of random initial points (`--init random`).
 RANDOM_POINTS = 20_000
-#: Maximum share of --max-gaussians at the start of a run whose points would give more Gaussians
-#: (docs/schedules.md), and the name of the state that stores the number without this limit.
+#: Maximum share of --max-gaussians with which a run starts if its points would give more Gaussians
+#: (docs/schedules.md). `THINNED` is the name of the state that stores the number without this
+#: limit.
 BEGINNING, THINNED = 2 / 3, "thinned"
-#: Maximum share of points that the next attempt keeps.
+#: The next attempt keeps at most this share of the points.
 _LESS = 0.8
 
 
@@ -131,8 +133,8 @@ def first_state(setup: Setup) -> TrainState:
     parameters = ordered(parameters, setup.blocks, setup.backbone.positions)
     trained = {name for block in setup.trained_blocks for name in block.tensors}
     parameters = {
-        # Make the tensors contiguous, as after a checkpoint, because another memory layout changes
-        # the rounding.
+        # Make the tensors contiguous, as they are after loading a checkpoint, because another
+        # memory layout changes the rounding.
         name: tensor.detach().to(setup.device).contiguous().requires_grad_(name in trained)
         for name, tensor in parameters.items()
     }
@@ -192,7 +194,7 @@ def _begun(setup: Setup) -> Scene:
         begun = initializer.begun(scene)
         wrong = _misfit(begun, len(scene.points))
     except ValueError as error:
-        initializer.more_points(scene)  # This raises errors of the initializer itself.
+        initializer.more_points(scene)  # This call raises the errors of the initializer itself.
         wrong = in_one_line(error)
     if not wrong:
         return begun
@@ -323,11 +325,12 @@ def warm_up(setup: Setup, reached: TrainState | None = None) -> float:
     start = perf_counter()
     setup.rasterizer.self_test(str(setup.device))
     setup, schedule = unwatched(setup), setup.schedule
-    # A run of one step has no second step for a test.
+    # A run of one step cannot test a second step.
     degrees = {max(schedule.sh_interval * degree, schedule.sh_wait) for degree in (1, 2, 3)}
     steps = [min(1, schedule.total - 1), *map(schedule.step_of, sorted(degrees))]
     if setup.densifier.needs:
-        # After the end of density control there are no statistics, which uses other kernels.
+        # Statistics are no longer collected after the end of density control, so training then uses
+        # other kernels.
         steps.append(schedule.step_of(schedule.densify_until))
     if schedule.grows:
         # An edit may render, too.
@@ -339,7 +342,7 @@ def warm_up(setup: Setup, reached: TrainState | None = None) -> float:
                 state.step = step
                 timed_step(setup, state)
                 if setup.sparse_rows and step == steps[0] and step + 1 < schedule.total:
-                    # Rows have deferred steps from the second step on.
+                    # From the second step on, some rows have deferred updates.
                     timed_step(setup, state)
     seconds = perf_counter() - start
     _LOG.debug("loaded kernels in %.1f s", seconds)

@@ -28,7 +28,7 @@ from crossgrad_core.training.rngs import make_streams, restored_streams, stream_
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.wording import listed
 
-#: Clock of a time budget: wall-clock seconds, or CPU seconds of the process.
+#: Clock of a time budget: it measures wall-clock seconds or CPU seconds of the process.
 ClockKind = Literal["wall", "cpu"]
 Phase = Literal[
     "photos",
@@ -41,8 +41,8 @@ Phase = Literal[
     "density_control",
     "other",
 ]
-#: Phases of a step. `photos` is the choice of views and scales and the access to photos (decoding
-#: files is loading). `loss` includes exposure, pixel weights and regularisation.
+#: Phases of a step. `photos` includes the choice of views and scales and the access to photos.
+#: Decoding of files belongs to loading. `loss` includes exposure, pixel weights and regularisation.
 PHASES: Final[tuple[Phase, ...]] = get_args(Phase)
 
 
@@ -572,5 +572,6 @@ def is_whole(state: TrainState) -> bool:
     try:
         return are_parameters_finite(state)
     except Exception:
-        # The last step failed, the check needs more memory than available, or the GPU failed.
+        # This fails if the last step failed, if the check needs more memory than available, or if
+        # the GPU failed.
         return False

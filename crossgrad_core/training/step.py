@@ -87,7 +87,7 @@ def model_of(setup: Setup, state: TrainState) -> Model:
     )
 
 
-#: Name of the state that contains the labels, and of their stream of random numbers.
+#: Name of the state that contains the labels, and name of their stream of random numbers.
 GROUPING = "grouping"
 _LABELS = "labels"
 
@@ -138,7 +138,8 @@ def observed_views(
         NonFiniteError: The loss of the extra view is not finite.
     """
     if setup.config.densify_views == "one":
-        # Use each position in turn, because a sampler may always put the same group first.
+        # In each step, use the view at another position of the sample, because a sampler may always
+        # put the same group first.
         return (records[state.step % len(records)],)
     wanted = setup.schedule.grows and setup.schedule.collects(state.step)
     if setup.config.densify_views != "extra" or not wanted:
@@ -152,11 +153,12 @@ def observed_views(
     return (*records, observe_view(setup, state, draw, scales_of(setup, state, draw)[0]))
 
 
-#: Minimum number of Gaussians that are sorted; with 59 parameters each, parameters and moments use
-#: 12 MB.
+#: Minimum number of Gaussians that are sorted. With 59 parameters per Gaussian, the parameters and
+#: moments use 12 MB.
 FEWEST_SORTED = 2**14
-#: Bits of a coordinate in a code of 63 bits, and cells per unit of the local frame. The cameras
-#: span about one unit; positions farther away than 128 units are clamped to the border cells.
+#: Number of bits of a coordinate in a code of 63 bits, and number of cells per unit of the local
+#: frame. The cameras span about one unit. Positions farther away than 128 units are clamped to the
+#: border cells.
 _BITS = 21
 _CELLS = 2**13
 #: Shifts and masks that insert two zeros between the bits of a number (Morton interleaving).
@@ -319,8 +321,8 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
     scale = setup.operator_scale.of(context)
     gradients = joined(aggregated.gradients, rendered.regular, of_step, scale)
     if setup.device.type == "cpu":
-        # On a GPU each check would wait for the device; the check of the parameters is enough
-        # there.
+        # Skip this check on a GPU, because it would wait for the device. The later check of the
+        # parameters is enough there.
         _check_finite(state, rendered, gradients, of_views)
     state.laps.lap("aggregation")
     counted = aggregated.counts
@@ -468,12 +470,14 @@ def _finish(
         _optimize(setup, state, rendered, gradients, scale)
         gradients.clear()
         if setup.schedule.densifies(state.step):
-            # Background steps keep gradients in memory, which an edit needs.
+            # Finish the background updates first, because they hold gradients in memory that an
+            # edit needs.
             state.late.finish()
         edit, edited = _densify(setup, state, rendered)
     else:
         edit, edited = _densify(setup, state, rendered)
-        # In the published order, an edit replaces tensors, so their gradients are not used.
+        # As published, an edit comes before the update and replaces tensors. Gradients of the
+        # replaced tensors are not used.
         gone = set(gradients) if edited else set(edit.values)
         if state.step < setup.schedule.total:
             left = {name: g for name, g in gradients.items() if name not in gone}
@@ -493,7 +497,7 @@ def _optimize(
     progress = setup.schedule.progress(state.step)
     take_photo_step(setup, state, rendered.photos, progress)
     rates, rule = rates_at(setup, state.step), rule_at(setup, state.step)
-    # Regularisation terms may give gradients to tensors that do not learn in this step.
+    # A regularisation term may give a gradient to a tensor that does not learn in this step.
     resting = setup.resting(state.step)
     learning = {name: coalesced(g) for name, g in gradients.items() if name not in resting}
     waiting = set(setup.sparse_rows.values())

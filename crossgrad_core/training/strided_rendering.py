@@ -60,8 +60,8 @@ def _copied(pixels: Tensor) -> Tensor:
     """Return a contiguous copy of the pixels."""
     if not pixels.is_cpu:
         return pixels.contiguous()
-    # Torch would use a second thread and wait for it if cores are busy. Copied by channel, because
-    # NumPy is slow with an inner dimension of three.
+    # Torch would use a second thread and wait for it if cores are busy. Copy each channel
+    # separately, because NumPy is slow with an inner dimension of three.
     copy = torch.empty(pixels.shape, dtype=pixels.dtype)
     for channel in range(pixels.shape[2]):
         np.copyto(copy.numpy()[:, :, channel], pixels.numpy()[:, :, channel])

@@ -348,7 +348,7 @@ def render_views(
     state.counters.backward_passes += len(records)
     if not setup.separate:
         return Rendered(with_losses, regular, tuple(photos)), total
-    # The separate gradients may be overwritten after their use, unless a plugin reads them.
+    # The operator may overwrite the separate gradients, unless a plugin reads them.
     apart = DenseGradients(per_view, setup.trained_blocks, overwrite=not setup.watchers)
     return Rendered(with_losses, regular, tuple(photos)), apart
 
@@ -530,7 +530,7 @@ def _seen(setup: Setup, state: TrainState, camera: Camera) -> Gaussians:
     gaussians = answered(answer, Gaussians, setup.backbone, "decode")
     names = {f: n for f, n in setup.sparse_rows.items() if getattr(gaussians, f) is tensors[n]}
     if names.keys() != {f for f in setup.sparse_rows if getattr(gaussians, f) is not None}:
-        # `decode` did not pass a tensor through unchanged, so it may have read outdated rows.
+        # `decode` did not pass a tensor through unchanged, so `decode` may have read outdated rows.
         state.settle()
         return setup.backbone.decode(tensors, camera, phase)
     if not names or not is_native([state.tensors[name] for name in names.values()]):
@@ -573,7 +573,7 @@ def _regularize_view(setup: Setup, state: TrainState, drawn: _Drawn, into: Tenso
 
 
 def _backward(loss: Tensor) -> None:
-    # A view without visible Gaussians has a constant image and no gradients; this is not an error.
+    # A view without visible Gaussians has a constant image and no gradients. This is not an error.
     if loss.requires_grad:
         loss.backward()  # type: ignore[no-untyped-call]
 

@@ -46,7 +46,8 @@ def thin_tracks(source: pycolmap.Reconstruction) -> dict[int, list[tuple[int, in
     kept = {}
     for point_id, point in sorted(source.points3D.items()):
         elements = sorted((e.image_id, e.point2D_idx) for e in point.track.elements)
-        # Each track starts at another photo, so that every photo keeps the same share.
+        # Start each track at another photo, so that all photos keep the same share of their
+        # observations.
         kept[point_id] = elements[point_id % min(len(elements), KEPT_SHARE) :: KEPT_SHARE]
     return kept
 
@@ -92,7 +93,8 @@ def main(source: Path, target: Path) -> None:
         path = target / "images" / image.name
         Image.fromarray(photo).save(path, quality=QUALITY, optimize=True, progressive=True)
     model.write_binary(target / "sparse" / "0")
-    # Rigs and frames of single cameras add no information to cameras and images.
+    # Delete the rigs and frames. For single cameras, they add no information to the cameras and
+    # images.
     for name in ("rigs.bin", "frames.bin"):
         (target / "sparse" / "0" / name).unlink(missing_ok=True)
     (target / "README.txt").write_text(README, encoding="utf-8")

@@ -31,7 +31,8 @@ def label_objections(
     if selection.sampler.own_labels:
         source, given = f"sampler {sampler}", selection.sampler.own_labels
     elif grouping is not None:
-        # A grouping by folders or lists takes its labels from the scene and declares none.
+        # A grouping by folders or lists takes its labels from the scene and has no labels of its
+        # own.
         source = f"grouping {selection.names['grouping']}"
         given = grouping.labels if selection.labels is None else selection.labels
     else:

@@ -29,7 +29,8 @@ from crossgrad_operators._nested import (
     reads_gramians,
 )
 
-#: A row of a product is rounding noise if it is shorter than this share of its terms.
+#: A row of a product counts as rounding noise if its length is below this share of the length of
+#: its terms.
 _NOISE = 1e-14
 
 

@@ -143,7 +143,7 @@ class Dispatch(GramianOperator):
             block_matrices, states[key] = transformed(
                 operators[key], gramians[block_indices], of_part, inner, rng
             )
-            # Rows are added at the end, so their number does not matter here.
+            # Only the sum of the rows matters here, so move all rows into the first row.
             if block_matrices.shape[1] != gramians.shape[1]:
                 block_matrices = _in_first_row(block_matrices, gramians.shape[1])
             matrices[block_indices] = block_matrices

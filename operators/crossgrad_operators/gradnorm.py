@@ -22,7 +22,8 @@ from crossgrad_core.plugin import (
 from crossgrad_operators._labels import label_objections, labels_of
 from crossgrad_operators._memory import recall, remember
 
-#: Group -> count, start and average of its losses. Scales below full size are stored by octave.
+#: Group -> number, initial value and average of its losses. Losses of scales below full size are
+#: stored for each octave.
 _Losses = dict[str, dict[str, Any]]
 
 

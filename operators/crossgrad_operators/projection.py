@@ -145,8 +145,8 @@ def project(
     if gates is None:
         gates = np.ones(gramians.shape, np.bool_)
     rule = (float(threshold), float(strength))
-    # With two views, each gradient takes one step with the error of the cosine. With more views the
-    # errors add up, but float32 gradients are too coarse to show them.
+    # With two views, each gradient takes one step with the error of one cosine. With more views,
+    # the errors add up. For float32 gradients, they are below the precision of the gradients.
     many = gramians.shape[1] > 2  # noqa: PLR2004
     if context.unit < NARROW and many and context.rounding_residuals is not None:
         rest = context.rounding_residuals()

@@ -19,7 +19,7 @@ from crossgrad_core.plugin import (
 _Value: TypeAlias = bool | int | float | str
 
 
-#: Weightings that do not depend on the Gramian.
+#: TorchJD weightings that do not depend on the Gramian.
 _FIXED = frozenset({"Constant", "Mean", "Random", "Sum"})
 
 

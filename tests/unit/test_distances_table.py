@@ -156,7 +156,7 @@ def test_a_stored_table_of_other_views_is_refused(tmp_path, place, printed, caps
     with pytest.raises(SystemExit) as ended:
         printed(tmp_path / "runs", "--of", "city", "--on", other)
     assert ended.value.code == 2
-    assert "figures of a run belong to other views" in capsys.readouterr().err
+    assert "metrics of this run were measured on other views" in capsys.readouterr().err
 
 
 def test_an_unknown_metric_gives_one_message_before_anything_is_evaluated(

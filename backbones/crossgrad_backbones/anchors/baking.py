@@ -15,8 +15,8 @@ from crossgrad_core.plugin import Camera, Gaussians
 
 #: Band 1 of the real spherical harmonics: sqrt(3 / (4 pi)).
 _SH_C1 = sqrt(3.0 / (4.0 * pi))
-#: Regularisation of the coefficients of band 1, as a share of the weight that directions from all
-#: sides would give them. It keeps band 1 at 0 if all directions are equal.
+#: Regularisation of the coefficients of band 1, as a share of their weight if directions come from
+#: all sides. The regularisation keeps band 1 at 0 if all directions are equal.
 RIDGE = 0.01
 _BASIS = 4
 
@@ -122,7 +122,7 @@ class _Sums:
     def add(self, rows: Tensor, look: Look) -> None:
         """Add the appearance of anchors `rows` in one camera."""
         sums = self.covariances[rows]
-        # A quaternion and its negative are the same rotation.
+        # A quaternion and its negative describe the same rotation, so give both the same sign.
         along = (sums[..., 3:] * look.covariances[..., 3:]).sum(-1, keepdim=True)
         look.covariances[..., 3:] *= torch.where(along < 0, -1.0, 1.0)
         self.covariances[rows] = sums + look.opacities[..., None] * look.covariances

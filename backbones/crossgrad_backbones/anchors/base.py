@@ -32,7 +32,8 @@ from crossgrad_core.plugin import (
 
 #: Near plane and dilation (px^2) of the filter: the defaults of the rasterizers.
 NEAR, DILATION = 1e-3, 0.3
-#: Number of standard deviations at which an opaque Gaussian falls below the alpha threshold.
+#: At this number of standard deviations, the alpha of an opaque Gaussian falls below the alpha
+#: threshold.
 REACH = math.sqrt(-2.0 * math.log(ALPHA_THRESHOLD))
 #: Distance of the first pixel's centre from the image border.
 _HALF_PIXEL = 0.5
@@ -79,7 +80,7 @@ def _plain(positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
         flat, pose, _axes(camera), strict=False
     ):
         slope = along / depth
-        # The row of the Jacobian in world axes, times depth / focal.
+        # The row of the Jacobian in world axes, multiplied by depth / focal.
         row = axis[:3] - slope.clamp(least, most)[:, None] * pose[2, :3]
         variance = (row.square() * squares).sum(1) * (focal / depth).square() + DILATION
         extent = REACH * variance.sqrt()

@@ -27,7 +27,8 @@ from crossgrad_core.numerics.jobs import parallel
 from crossgrad_core.plugin import Camera, Gaussians
 
 Gradients: TypeAlias = tuple[Tensor | None, ...]
-#: Indices of opacity, covariance and colour, and the index of the covariance among them.
+#: Indices of the outputs for opacity, covariance and colour, and index of the covariance among
+#: these three.
 _HEADS, _COVARIANCE = (0, 1, 2), 1
 #: Index of the scales among means, quaternions, scales, opacities and colours.
 _SCALES = 2
@@ -152,7 +153,7 @@ def _filled(given: Gradients, kept: Kept) -> list[NDArray[Any]]:
     ]
 
 
-#: Names of the outputs of `forward`; the first five are differentiable.
+#: Names of the outputs of `forward`. The first five outputs are differentiable.
 _OUTPUTS = ("means", "quats", "scales", "opacities", "colors", "origin", "slot")
 _DIFFERENTIABLE = 5
 

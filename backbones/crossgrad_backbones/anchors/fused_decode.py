@@ -18,8 +18,8 @@ from crossgrad_backbones.anchors.numba_kernels import networks as layers
 from crossgrad_core.numerics.elementwise import sigmoid_
 from crossgrad_core.numerics.jobs import parallel
 
-#: Number of anchors per stretch, a multiple of PANEL. It is fixed, so that sums do not depend on
-#: the machine.
+#: Number of anchors in a stretch, which is a multiple of PANEL. The number is fixed, so that sums
+#: do not depend on the machine.
 STRETCH = 2048
 #: Weight and bias of a linear layer.
 Layer = tuple[Tensor, Tensor]
@@ -119,7 +119,8 @@ def forward(inputs: Inputs) -> tuple[tuple[Tensor, ...], Kept]:
     read = (opacities, inputs.view.positions, inputs.offsets, spreads, inputs.view.rows)
     written = (origin, slot, means, quats, shares, scales, kept, colors)
     _fill(inputs, hidden, (*map(array, read), starts, *map(array, written)))
-    # The kernel wrote raw values and the anchor's size, because torch's sigmoid is vectorised.
+    # Apply the sigmoid here, because torch's sigmoid is vectorised. The kernel wrote values before
+    # the sigmoid, and the anchor's size into `scales`.
     scales.mul_(sigmoid_(shares))
     sigmoid_(colors)
     remembered = (array(spreads), starts, array(slot), array(shares), array(colors))

@@ -17,13 +17,13 @@ from typing_extensions import override
 from crossgrad_core.numerics.elementwise import sigmoid
 from crossgrad_core.plugin import Block, BlockKind, Gaussians, LearningRate, Parameters
 
-#: Width of the direction from the camera to the anchor.
+#: Number of values of the direction from the camera to the anchor.
 DIRECTION = 3
-#: Indices of the two linear layers; index 1 is the ReLU between them.
+#: Indices of the two linear layers. The ReLU between them has index 1.
 LAYERS = (0, 2)
-#: Strides at which the feature bank reads the feature, from coarse to fine.
+#: Strides with which the feature bank reads the feature, from coarse to fine.
 BANK_STRIDES = (4, 2, 1)
-#: Number of covariance values per Gaussian: 3 scales and a quaternion wxyz.
+#: Number of covariance values per Gaussian: three for the scales, and four for the quaternion wxyz.
 COVARIANCE = 7
 _CHANNELS = 3
 #: Number of rows that are summed at once.
@@ -123,7 +123,7 @@ class Heads:
     def views(self, offset: Tensor) -> Tensor:
         """Return direction and distance [A, 4] of anchors at `offset` [A, 3] from the camera."""
         distance = torch.linalg.vector_norm(offset, dim=1, keepdim=True)
-        # An anchor exactly at the camera centre has no direction.
+        # Avoid a division by zero: an anchor exactly at the camera centre has no direction.
         direction = offset / distance.clamp(min=torch.finfo(offset.dtype).tiny)
         return torch.cat([direction, distance], 1)
 

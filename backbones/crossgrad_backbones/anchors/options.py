@@ -21,7 +21,8 @@ from crossgrad_core.plugin import (
 )
 
 _FROZEN = LearningRate(0.0)
-#: Names of the codes [V, C] and of the poses [V, 3, 4] (float64, frozen) of the training views.
+#: Names of two tensors of the training views: the codes [V, C] and the poses [V, 3, 4] (float64,
+#: frozen).
 CODES, POSES = "appearance", "appearance_poses"
 
 

@@ -9,10 +9,12 @@ from torch import Tensor
 SMALLEST_VOXEL = 1e-5
 #: Automatic voxel size of a cloud without neighbours, in local units.
 LONE_VOXEL = 0.01
-#: Automatic voxel size, in median distances between neighbours. With 1, nearly every point gets its
-#: own anchor, that is ten Gaussians where vanilla has one.
+#: Automatic voxel size, in units of the median distance between neighbours. With a value of 1,
+#: nearly every point would get its own anchor. An anchor has ten Gaussians, but vanilla has one
+#: Gaussian per point.
 SPACING = 2.0
-#: Cells farther from the origin are left out: their integer coordinates would not be exact.
+#: Cells that are farther from the origin than this are left out, because their integer coordinates
+#: would not be exact.
 FARTHEST = 2**40
 
 

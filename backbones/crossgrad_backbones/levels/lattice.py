@@ -12,7 +12,8 @@ from crossgrad_backbones.anchors.voxels import automatic_voxel_size
 
 #: Maximum number of levels, which is more than any scene needs.
 MOST_LEVELS = 16
-#: Least edge of a cell, as a share of the largest coordinate: float32 rounds positions to 2^-24.
+#: Minimum edge of a cell, as a share of the largest coordinate. Float32 rounds positions to 2^-24
+#: of their size.
 RESOLUTION = 2.0**-20
 #: The bounds of the initial points are moved away from 0 by this factor (Octree-GS).
 BOX_FACTOR = 1.1
@@ -125,7 +126,7 @@ class Lattice:
 
         A step computes this value for every anchor.
         """
-        # Do not use exp2: its rounding depends on the number of threads.
+        # Do not use exp2, because its rounding depends on the number of threads.
         return torch.exp(torch.log(self.fork) * exponents)
 
     def faded(self, distances: Tensor, levels: Tensor, extra: Tensor) -> Tensor:
@@ -177,7 +178,7 @@ def distance_range(
     quantiles = (1.0 - ratio, ratio)
     pooled = [np.quantile(np.linalg.norm(points - c, axis=1), quantiles) for c in centers]
     smallest, largest = (float(value) for value in np.quantile(pooled, quantiles))
-    # All points and all cameras have the same position, so any distance is valid.
+    # If all points and all cameras have the same position, any distance is valid.
     largest = largest if largest > 0.0 else 1.0
     return largest, max(smallest, largest * 2.0**-MOST_LEVELS)
 

@@ -140,7 +140,7 @@ def seen_from_farther(
     return (count > 0) & (mean >= thresholds.at(parameters["levels"]))
 
 
-#: The published schedule has 40,000 steps: anchors grow after step 1500 and before step 25,000.
+#: The published schedule has 40,000 steps. Anchors grow after step 1500 and before step 25,000.
 _LENGTH, _FROM, _UNTIL, _EVERY = 40_000, 1500, 25_000, 100
 
 

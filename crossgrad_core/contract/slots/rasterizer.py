@@ -51,7 +51,7 @@ class Rasterizer(Component):
             cls.sparse_rows = False
 
     @classmethod
-    def speed(cls, device: str) -> float:  # noqa: ARG003 - for those that run somewhere
+    def speed(cls, device: str) -> float:  # noqa: ARG003 - subclasses use the argument
         """Return a speed rank on a device; `--rasterizer auto` chooses the highest rank.
 
         The ranks are 1 for the readable reference, 10 for compiled kernels on a CPU, 100 on a GPU.
@@ -64,7 +64,7 @@ class Rasterizer(Component):
         return 0.0
 
     @classmethod
-    def missing(cls, device: str) -> str:  # noqa: ARG003 - for those that need a package
+    def missing(cls, device: str) -> str:  # noqa: ARG003 - subclasses use the argument
         """Return the missing requirements for a device on this machine, and how to install them.
 
         Empty if nothing is missing, or if the rasterizer does not support the device. `--device

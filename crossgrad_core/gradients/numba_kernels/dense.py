@@ -23,9 +23,10 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Rows = NDArray[np.float32]
 
-#: Elements of one chunk, 64 kB per view: a chunk of sixteen views fits into the L2 cache.
+#: Number of elements of one chunk, which has 64 kB per view. A chunk of sixteen views fits into the
+#: L2 cache.
 CHUNK = 16384
-#: Elements of a chunk that a weighted sum processes at a time.
+#: Number of elements of a chunk that a weighted sum processes at a time.
 PIECE = 1024
 
 
@@ -330,7 +331,8 @@ def _combine_chunk(
         for i in range(result.size):
             result[i] = 0.0
     elif count == 2 and (out == rows[0] or out == rows[1]):
-        # The most common case: two views, one of them overwritten. Both sums are commutative.
+        # The most common case has two views, and the result overwrites the gradient of one view.
+        # The order of the two summands has no effect.
         this = 0 if out == rows[0] else 1
         a, b = row(out, first, end - first), row(rows[1 - this], first, end - first)
         if plain:

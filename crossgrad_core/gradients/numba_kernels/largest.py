@@ -8,7 +8,7 @@ from crossgrad_core.gradients.numba_kernels.pointers import float32_pointer
 from crossgrad_core.numerics.jit import kernel
 from crossgrad_core.numerics.jobs import Jobs, next_job
 
-#: Elements that a thread processes at a time.
+#: Number of elements that a thread processes at a time.
 PART = 2**15
 _ALL_BUT_SIGN = np.uint32(0x7FFFFFFF)
 
@@ -42,7 +42,8 @@ def largest_bits(
         size, first = sizes[tensor], (part - starts[tensor]) * PART
         bits = carray(float32_pointer(addresses[tensor]), size).view(np.uint32)
         part_bits = bits[first : min(size, first + PART)]
-        # Read four streams at a time, which waits less for memory than one stream.
+        # Read four streams at a time. The processor then waits less for memory than with one
+        # stream.
         quarter = len(part_bits) // 4
         p, q = part_bits[:quarter], part_bits[quarter : 2 * quarter]
         r, s = part_bits[2 * quarter : 3 * quarter], part_bits[3 * quarter : 4 * quarter]

@@ -9,7 +9,7 @@ from crossgrad_core.gradients.numba_kernels.dense import Flags, Floats, Ints, ro
 from crossgrad_core.numerics.jit import strict_device, strict_kernel
 from crossgrad_core.numerics.jobs import Jobs, next_job
 
-#: Rows of one task.
+#: Number of rows that one task processes.
 ROWS = 2048
 
 

@@ -140,7 +140,7 @@ def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, To
             if name != PER_VIEW or not _loses_figures(folder, result):
                 with relisted(folder, name):
                     write_per_view(folder, result, name)
-        # The peak memory of this process is not the run's.
+        # The peak memory of this process is not the peak memory of the run.
         return result, replace(totals(setup, state), peak_memory_mib=None)
 
 

@@ -18,7 +18,7 @@ from crossgrad_core.system.files import clear_leftovers
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.wording import one_line
 
-#: Suffixes of Gaussian file formats; a file must not have the suffix of another format.
+#: Suffixes of Gaussian file formats. A file must not have the suffix of another format.
 _OF_FORMATS: Final = frozenset({".ply", ".splat", ".ksplat", ".spz", ".sog", ".rad", ".usdz"})
 
 

@@ -126,7 +126,7 @@ def render_path(
                 drop_frames(out, len(files))
             made = write_video(files, along.fps)
             for video in video_files(out) if is_default_folder else ():
-                if video != made:  # Frames of another video exist.
+                if video != made:  # The existing frames belong to another video.
                     video.unlink(missing_ok=True)
         video_line = (
             f"video {made}"

@@ -14,7 +14,7 @@ from crossgrad_core.wording import listed
 FILE = "config.yaml"
 #: Settings that the file of every run contains.
 _ALWAYS: Final = ("scene", "seed")
-#: The key that names the version that wrote a configuration, and the version of this one.
+#: The key for the version of crossgrad that wrote a configuration, and the current version.
 KEY: Final = "crossgrad"
 CURRENT: Final = ".".join(VERSION.split(".")[:2])
 #: The key of the notes, which are written with the settings.

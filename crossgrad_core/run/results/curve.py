@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 FILE = "curve.png"
 _OVERALL = "overall"
 
-#: Okabe and Ito's colours, distinguishable with any colour vision; black is kept for `overall`.
+#: Okabe and Ito's colours, distinguishable with any colour vision. Black is kept for `overall`.
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _MARKERS = ("s", "^", "D", "v", "P", "X")
 _STYLES = ("--", "-.", ":")
 #: With more points than this, markers would hide the line.
 _MOST_MARKERS = 25
-_LONGEST_IN_TWO_COLUMNS = 48  # characters of a legend entry
+_LONGEST_IN_TWO_COLUMNS = 48  # in characters of a legend entry
 
 
 class _Line(NamedTuple):
@@ -82,7 +82,7 @@ def _lines(rows: Sequence[Row], views: Mapping[str, int]) -> list[_Line]:
     lines = [_Line(_labelled(_OVERALL, "", rows[-1], views), "")]
     regimes = [name for name in sorted(views) if name != _OVERALL and f"psnr_{name}" in rows[0]]
     looks = zip(cycle(_COLORS), cycle(_MARKERS), cycle(_STYLES), strict=False)
-    if len(regimes) > 1:  # A single regime would repeat `overall`.
+    if len(regimes) > 1:  # The curve of a single regime would be equal to the curve `overall`.
         for name, look in zip(regimes, looks, strict=False):
             lines.append(_Line(_labelled(name, f"_{name}", rows[-1], views), f"_{name}", *look))
     return lines

@@ -19,7 +19,7 @@ from crossgrad_core.system.files import (
     is_leftover,
 )
 
-#: Space that a run with a small scene and few renders may take, in bytes.
+#: Number of bytes that a run with a small scene and few renders may write.
 SMALLEST_NEED = 64 * 2**20
 #: Folder that contains all runs, relative to the working folder.
 RUNS = Path("runs")
@@ -73,7 +73,7 @@ def create_run_folder(
         raise disk_full(wanted, needed)
     with disk_errors(wanted):
         folder = _made(wanted, taken=out is not None)
-        # Permission bits are not reliable on network file systems; a test file is.
+        # Write a test file, because permission bits are not reliable on network file systems.
         with tempfile.TemporaryFile(dir=folder) as probe:
             probe.write(b"crossgrad")
     return folder

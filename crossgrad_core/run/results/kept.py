@@ -14,7 +14,8 @@ from crossgrad_core.system.input_files import read_file
 from crossgrad_core.system.yaml_values import read_mapping, read_yaml
 from crossgrad_core.wording import listed
 
-#: Scalar of a checkpoint that contains the texts: name of a file -> its content.
+#: Key of the scalar in a checkpoint that contains the text files as a mapping: file name ->
+#: content.
 KEY: Final = "files"
 #: Settings that a run with a time budget rewrites.
 _REVISED: Final = frozenset({"steps", "revisions"})

@@ -18,15 +18,15 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.system.check_writable import check_own
 from crossgrad_core.system.files import disk_errors
 
-#: Name of the locked file. The file remains when its process has ended; then no process holds the
-#: lock.
+#: Name of the locked file. The file remains when its process has ended, but then no process holds
+#: the lock.
 FILE = "run.lock"
 
 _TAKEN = frozenset({errno.EAGAIN, errno.EACCES, errno.EWOULDBLOCK, errno.EDEADLK})
 # Windows locks ranges of bytes, which other processes then cannot read. Lock a byte far after the
 # content.
 _FAR = 2**30
-_MOST = 4096  # most bytes of a holder's description
+_MOST = 4096  # maximum number of bytes of the lock holder's description
 
 
 @dataclass(frozen=True)

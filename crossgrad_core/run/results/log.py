@@ -192,7 +192,8 @@ class RunLog:
         gap = [f"(lines are missing here: {self._missing})"] if self._missing else []
         lines = [f"{stamp}  {line}".rstrip() for line in (*gap, *showable(text).splitlines())]
         try:
-            # Opened for every entry, so that the file is complete even if the run is interrupted.
+            # The file is opened for every entry, so that it is complete even if the run is
+            # interrupted.
             with self._path.open("a", encoding="utf-8", errors="backslashreplace") as file:
                 file.write("\n".join([*lines, ""]))
             self._missing = ""

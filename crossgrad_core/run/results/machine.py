@@ -22,7 +22,8 @@ CALIBRATION_SECONDS = 2.0
 #: Runs that trained for fewer seconds are not calibrated, because calibration would take too long
 #: for them.
 WORTH_A_CALIBRATION = 20.0
-#: Numbers in the fixed workload, and passes over them between two readings of the clock.
+#: Number of values in the fixed workload, and number of passes over the values between two readings
+#: of the clock.
 _NUMBERS, _PASSES = 1 << 16, 8
 
 
@@ -141,7 +142,7 @@ def commit(package: Path = Path(__file__).parents[2]) -> str | None:
 
 
 def _git(root: Path, *arguments: str) -> str:
-    # Without locks: others may commit while a run only reads.
+    # Take no locks, so that other processes can commit while a run reads.
     command = ["git", "--no-optional-locks", "-C", str(root), *arguments]
     done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=20)
     return done.stdout.strip()

@@ -41,7 +41,7 @@ class Totals:
 
 
 FILE = "metrics.csv"
-#: Column -> value; None if it was not measured.
+#: Column -> value, or None if the value was not measured.
 Row: TypeAlias = dict[str, int | float | None]
 _FIRST = ("step", "views", "backward_passes", "train_seconds", "cpu_seconds")
 _LAST = ("primitives", "peak_memory_mib", "loss")
@@ -106,7 +106,7 @@ class MetricsCsv:
                 found=",".join(lines[0]) if lines else "an empty file",
                 todo="resume with the scene and the split that the run was started with",
             )
-        # A row that a crash cut short has fewer cells; the resumed run writes it again.
+        # A row that a crash cut short has fewer cells. The resumed run writes this row again.
         whole = [line for line in lines[1:] if len(line) == len(table.columns)]
         steps = [row["step"] for row in _rows(path, lines[0], whole)]
         lines_and_steps = zip(whole, steps, strict=True)

@@ -58,7 +58,7 @@ def chosen_views(views: "Sequence[View]", count: int) -> "tuple[View, ...]":
     groups = [[view for view in views if view.regime == regime] for regime in regimes]
     share = [0] * len(groups)
     for _ in range(min(count, len(views))):
-        # The first of the regimes with the fewest chosen views gets one more.
+        # Among the regimes with the fewest chosen views, the first regime gets one more view.
         unused = [i for i, group in enumerate(groups) if share[i] < len(group)]
         share[min(unused, key=share.__getitem__)] += 1
     chosen = {
@@ -197,7 +197,7 @@ def _unreadable(path: Path, found: str) -> UserError:
     )
 
 
-#: Errors of at least this size get the last colour; the limit is fixed, so that panels are
+#: Errors of at least this size get the last colour. The limit is fixed, so that panels are
 #: comparable.
 LARGEST_ERROR = 0.25
 _COLORMAP = "inferno"
@@ -312,7 +312,7 @@ def _font(size: int, *, bold: bool = False) -> "FreeTypeFont":
 
 def _label(draw: "ImageDraw", layout: Layout, metrics: ViewMetrics, step: int) -> None:
     bold, font = _font(layout.font, bold=True), _font(layout.font)
-    line = layout.margin + layout.font  # base line of the title
+    line = layout.margin + layout.font  # baseline of the title
     draw.text((layout.margin, line), metrics.name, fill=_INK, font=bold, anchor="ls")
     after = layout.margin + draw.textlength(metrics.name, font=bold) + layout.font
     text = f"{metrics.regime}, step {step:,}"

@@ -20,9 +20,9 @@ from crossgrad_core.run.results.summary import read_summary
 from crossgrad_core.system.checksums import check_unchanged
 from crossgrad_core.system.text_files import read_json
 
-#: File with the fingerprint of a run's scene; results/scene_file.py writes it.
+#: File with the fingerprint of a run's scene. The module results/scene_file.py writes it.
 SCENE = "scene.json"
-#: The files of a run that are read.
+#: The files of a run that this module reads.
 _READ: Final = (CONFIG, METRICS, PER_VIEW, SUMMARY, SCENE)
 
 

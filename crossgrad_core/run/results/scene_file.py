@@ -14,7 +14,8 @@ from crossgrad_core.system.checksums import changed_files
 from crossgrad_core.system.files import write_atomically
 from crossgrad_core.system.input_files import read_file
 
-#: Advice for the most serious difference; None is the key for a difference that can be accepted.
+#: Advice for the most serious difference. The key None stands for a difference that can be
+#: accepted.
 _WAYS_OUT = {
     None: "restore the scene, or add --accept-scene to continue with the changed scene",
     Weight.HELD_OUT: (

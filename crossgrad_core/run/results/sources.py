@@ -10,9 +10,9 @@ from typing import Final
 from crossgrad_core.system.files import text_bytes, write_atomically
 from crossgrad_core.system.text_files import read_json
 
-#: The file with name -> path of the source.
+#: The file that maps the name of a source to its path.
 FILE: Final = "sources.json"
-#: The name of the camera path that comes from no file.
+#: The name of the built-in camera path, which does not come from a file.
 RESERVED: Final = ("zoom",)
 
 

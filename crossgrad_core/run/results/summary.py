@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 FILE = "summary.json"
 Status = Literal["finished", "stopped", "failed"]
-#: Note that is added to every metric; values are comparable only under the same definition.
+#: Note that is added to every metric, because values are comparable only under the same definition.
 RENDERS = "rounded to 8 bits per channel before comparison; masked pixels do not count"
 
 

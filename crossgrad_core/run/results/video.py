@@ -14,7 +14,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.system.files import atomic_file, disk_errors, write_atomically
 from crossgrad_core.system.interrupts import HELPERS
 
-#: The program that writes videos; without it, Pillow writes an animated image.
+#: The program that writes videos. Without this program, Pillow writes an animated image.
 ENCODER: Final = "ffmpeg"
 _QUALITY: Final = 85
 #: Maximum number of bytes of all frames of an animated image, which are in memory at the same time.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import strict_device, strict_kernel
 
-#: Columns that are filtered at once, so that they stay in the cache of a core.
+#: Number of columns that are filtered at once, so that they stay in the cache of a core.
 _BLOCK = 1024
 
 
@@ -145,7 +145,8 @@ def shrink(
     filtered = np.empty((2, width * channels))
     held = np.full(2, -1)
     left, right, near = _columns(columns, channels, width)
-    # Both rows times their weights, and the values interpolated between their pixels.
+    # Buffers for the upper and the lower row times their weights, and for the values interpolated
+    # between their pixels.
     above, below = np.empty(width * channels), np.empty(width * channels)
     values = np.empty(columns * channels)
     for row in range(rows):

@@ -34,11 +34,12 @@ from crossgrad_core.scene.photos.shapes import check_mask, choose_reduction, is_
 from crossgrad_core.scene.raw import RawScene
 from crossgrad_core.scene.wording import count, name_some
 
-#: Photos of 8, 10, 12 or 14 bits reach this share of their range; darker photos are ambiguous.
+#: A photo with 8, 10, 12 or 14 bits is recognised if its largest value reaches this share of the
+#: range. A darker photo is ambiguous.
 _REACHED: Final = 0.8
-#: Photos with a larger value use all 16 bits.
+#: Photos with a larger value than this use all 16 bits.
 _DARK: Final = WHITES[-2]
-#: Photos that are decoded before the largest value is checked.
+#: Number of photos that are decoded before the largest value is checked.
 _AT_ONCE: Final = 8
 
 
@@ -136,7 +137,7 @@ def choose_photos(raw: RawScene, options: SceneOptions) -> ChosenPhotos:
         header = header.reduced(reduction)
         width, height, orientation = _fit(view.calibration, header, path)
         fitted = view.calibration.resized(width, height)
-        # Photos of one camera share its undistortion.
+        # Photos of one camera share one undistortion.
         fitted = shared.setdefault(fitted, fitted)
         target = _limit(fitted.pinhole.width, fitted.pinhole.height, options.max_size)
         pinholes[view.name] = fitted.pinhole.resized(*target)

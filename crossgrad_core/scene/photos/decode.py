@@ -21,11 +21,12 @@ Pixels = NDArray[np.uint8]
 RESIZE_FILTER = "scikit-image resize, anti-aliased"
 
 _FULL_8_BIT, FULL_16_BIT = 255, 65535
-#: White of files that store 1, 8, 10, 12, 14 or 16 bits.
+#: Value of white in files that store 1, 8, 10, 12, 14 or 16 bits.
 WHITES = (1, _FULL_8_BIT, 1023, 4095, 16383, FULL_16_BIT)
-#: A mask of black and white has at most this share of pixels farther than a tenth from both.
+#: In a black-and-white mask, at most this share of the pixels differs from both black and white by
+#: more than a tenth of the range.
 _MOST_GREY = 0.05
-#: Bytes of a photo that are copied at once, so that they stay in the processor's cache.
+#: Number of bytes of a photo that are copied at once, so that they stay in the processor's cache.
 _BAND = 1 << 19
 #: SciPy cuts its Gaussian filter off at this many standard deviations.
 _WIDTHS = 4.0
@@ -95,7 +96,8 @@ def _resized_by_skimage(image: Pixels, width: int, height: int) -> Pixels:
     from skimage import transform
 
     resize_floats: Callable[..., NDArray[np.float32]] = transform.resize
-    # float32 halves the time of float64 and differs by less than a hundredth of a grey level.
+    # Resizing in float32 takes half the time of float64. The results differ by less than a
+    # hundredth of a grey level.
     floats = resize_floats(image.astype(np.float32), (height, width), anti_aliasing=True)
     return np.asarray(np.rint(floats).clip(0, _FULL_8_BIT), dtype=np.uint8)
 

@@ -15,8 +15,9 @@ from typing import Final, TypeAlias
 
 from crossgrad_core.scene.photos.pillow import SUFFIXES
 
-#: Similarity of a file's path to a name: same folders, number of equal folders at the end, one path
-#: ends with the other, same base name up to letter case, same base name. Greater is more similar.
+#: Similarity of a file's path to a name. Its parts are: same folders, number of equal folders at
+#: the end, one path ends with the other path, same base name except letter case, same base name.
+#: Greater is more similar.
 _Likeness: TypeAlias = tuple[bool, int, bool, bool, bool]
 #: Suffixes of photos and masks.
 IMAGES: Final = frozenset(
@@ -108,7 +109,7 @@ class FileNames:
         for likeness, files in best.values():
             for file in files:
                 claims[file].append(likeness)
-        # A file is not paired with this name if another name is more similar to its path.
+        # Do not pair a file with this name if another name is more similar to the file's path.
         held = {
             name: (likeness, [file for file in files if likeness == max(claims[file])])
             for name, (likeness, files) in best.items()

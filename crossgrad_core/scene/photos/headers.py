@@ -16,10 +16,10 @@ _JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", 0xDA, b"\xff\xd9"
 _PNG_START, _PNG_END = b"\x89PNG", b"IEND\xaeB`\x82"
 _PNG_DEPTH, _PNG_CHANNELS = 24, {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 _JPEG_PIXELS_PER_BYTE = 8 * 64
-_DEFLATE_RATIO = 1032  # https://zlib.net/zlib_tech.html, maximum compression factor
+_DEFLATE_RATIO = 1032  # Maximum compression factor, https://zlib.net/zlib_tech.html
 _ORIENTATION = 0x0112
 _QUARTER_TURNS = range(5, 9)
-_TIFF_DATA = ((273, 279), (324, 325))  # offsets and byte counts of strips and of tiles
+_TIFF_DATA = ((273, 279), (324, 325))  # tags of the offsets and byte counts of strips and of tiles
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def _most_pixels(image: "Image", file: BinaryIO, size: int) -> float:
     A header that claims more pixels would make the decoder allocate memory for a missing photo.
     """
     if image.format in {"JPEG", "MPO"}:
-        # A block of 8 x 8 pixels needs at least one bit, the Huffman code of its mean.
+        # Each block of 8 x 8 pixels needs at least one bit: the Huffman code of its mean.
         return _JPEG_PIXELS_PER_BYTE * size
     if image.format == "PNG":
         file.seek(_PNG_DEPTH)

@@ -19,13 +19,14 @@ from crossgrad_core.wording import listed
 
 _MIB = 2**20
 _SHOWN_SIZES = 3
-#: Undistortion of ordinary lenses loses less than this share of the pixels.
+#: The undistortion of ordinary lenses removes less than this share of the pixels.
 _WORTH_A_NOTE = 0.1
 Sources = Mapping[str, PhotoSource]
-#: Files of crossgrad: a folder with one of the first set was written by a run or by `prepare`.
+#: Files that crossgrad writes. A folder that contains a file of the first set was written by a run
+#: or by `prepare`.
 _OWN_FOLDERS: Final = frozenset({"config.yaml", "plan.json"})
 _OWN_FILES: Final = frozenset({"report.png"})
-#: Largest number of groups of unused files with a separate note.
+#: Maximum number of groups of unused files with a separate note.
 _MOST: Final = 8
 
 

@@ -26,11 +26,11 @@ import torch
 from torch import Tensor
 
 _LOG = logging.getLogger(__name__)
-#: Environment variable for the folder of all entries; the default is in the user's cache folder.
+#: Environment variable for the folder of all entries. The default is in the user's cache folder.
 FOLDER: Final = "CROSSGRAD_CACHE"
 #: Raised whenever decoding, undistorting or resizing gives other bits than before.
 PIXELS_VERSION: Final = 2
-#: Bytes of a disk that are kept free.
+#: Number of bytes that must remain free on the disk.
 RESERVE: Final = 2 * 2**30
 _MAGIC, _SUM = b"CGphoto1", 4
 _KEPT, _TEMPORARY = ".photo", ".tmp"
@@ -87,7 +87,8 @@ class PhotoStore:
         self._limit = mib * 2**20
         self._begun = time() - _GRAIN
         self._used: int | None = None
-        # Last use of each entry that this store wrote or checked: valid while it is the file time.
+        # Entry that this store wrote or checked -> its last use. The value is valid as long as it
+        # equals the file time.
         self._sound: dict[Path, int] = {}
         self._lock = Lock()
         self._open = mib > 0
@@ -163,7 +164,7 @@ class PhotoStore:
         for last_used, length, path in entries:
             if used + size <= self._limit or last_used >= self._begun:
                 break
-            # Another process may have replaced the file first, or may hold it open.
+            # Another process may have replaced the file first, or may hold the file open.
             with suppress(OSError):
                 path.unlink()
                 used -= length

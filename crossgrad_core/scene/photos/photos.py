@@ -28,12 +28,14 @@ from crossgrad_core.scene.photos.decode import (
 from crossgrad_core.scene.photos.photo_store import Decoded, PhotoStore, Storable, made_by
 from crossgrad_core.scene.photos.shapes import is_turned
 
-#: JPEG files are decoded at an eighth of their sides for the test, which reads all of their data.
+#: For the test, JPEG files are decoded at an eighth of their width and height. This still reads all
+#: data of the file.
 SMALLEST = 8
 _OPAQUE, _HALF = 255, 128
 #: Seconds to wait for a photo that another thread is decoding.
 _PATIENCE = 0.5
-# Size of the cache: more than the views of one step, so that no photo is decoded twice in one step.
+# Number of photos in the cache. It is larger than the number of views of one step, so that no photo
+# is decoded twice in one step.
 _LATEST = 16
 #: Photos with fewer pixels are decoded about as quickly as they are read from the disk cache.
 _LARGE = 2_000_000
@@ -168,7 +170,7 @@ class PhotoSource:
         return _both(keep, np.where(distorted.reached(), _OPAQUE, 0).astype(np.uint8))
 
 
-#: Hashable; two equal keys decode to the same pixels.
+#: Type of the keys. Keys are hashable, and equal keys decode to the same pixels.
 Key = TypeVar("Key", bound=Storable)
 
 

@@ -15,7 +15,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.scene.photos.photos import FilePhoto
 from crossgrad_core.scene.wording import name_some
 
-#: Photos that are decoded at the same time; more photos would use more memory.
+#: Number of photos that are decoded at the same time. More photos would use more memory.
 AT_ONCE = 2
 #: Seconds that the end of a run waits for the photos that are still being decoded.
 _PATIENCE = 5.0
@@ -78,7 +78,8 @@ class PhotosAhead:
         cache, size, fitting = photos[0].cache, 0, list[FilePhoto]()
         for photo in photos:
             size += photo.source.decoded_bytes
-            if size <= cache.limit // 2:  # More photos would push them out of the cache.
+            # Leave out later photos, because they would push earlier photos out of the cache.
+            if size <= cache.limit // 2:
                 fitting.append(photo)
         cache.expect(photo.source for photo in fitting)
         with self._changed:
@@ -121,8 +122,8 @@ class PhotosAhead:
         try:
             decode(view, keep=self._keep)
         except MemoryError:
-            self._unseen = iter(())  # Training needs the memory more than prefetching.
-        except Exception as error:  # Third-party photos may raise anything.
+            self._unseen = iter(())  # Stop prefetching, because training needs the memory more.
+        except Exception as error:  # Photos of a plugin may raise any exception.
             self._unseen = iter(())
             report, self._report = self._report, _ignore
             report(error)
@@ -161,7 +162,7 @@ def _give_way() -> None:
 def fits(scene: Scene, mib: int) -> bool:
     """Return True if all decoded photos of a scene fit into memory, so none is decoded twice."""
     pixels = sum(view.camera.width * view.camera.height for view in scene.views)
-    return 4 * pixels <= mib * 2**20  # RGB and a mask
+    return 4 * pixels <= mib * 2**20  # Three bytes for RGB and one byte for a mask
 
 
 def check_photos(views: Sequence[View], *, keep: bool, whole: bool = False) -> None:

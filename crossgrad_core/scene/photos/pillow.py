@@ -31,7 +31,7 @@ _LOCK = Lock()
 _DEEP = re.compile("RGBA?;16[BLN]")
 #: Suffixes of HEIC and HEIF files.
 SUFFIXES = (".heic", ".heif", ".hif")
-#: Bytes at the start of a file that identify HEIC and HEIF.
+#: Number of bytes at the start of a file that identify a HEIC or HEIF file.
 HEAD = 12
 _BRANDS = frozenset(
     {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"hevm", b"hevs", b"mif1", b"msf1"}
@@ -145,7 +145,7 @@ def _identified(file: BinaryIO, path: Path) -> "Image":
     allowed = (*_FORMATS, "HEIF") if admit(file.read(HEAD), path) else _FORMATS
     file.seek(0)
     formats = [name for name in allowed if name in Image.OPEN]
-    with _LOCK:  # Pillow's limit is a global, and photos are decoded in several threads.
+    with _LOCK:  # Pillow's limit is a global variable, and photos are decoded in several threads.
         bound, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
         try:
             return Image.open(file, formats=formats)
@@ -181,6 +181,6 @@ def _registered() -> bool:
         from pillow_heif import register_heif_opener
     except ImportError:
         return False
-    # Photos are already decoded in several threads.
+    # Use one thread here, because photos are already decoded in several threads.
     register_heif_opener(thumbnails=False, decode_threads=1)
     return True

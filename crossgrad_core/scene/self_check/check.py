@@ -21,7 +21,7 @@ from crossgrad_core.scene.self_check.evidence import Floats, Integers, Pixels, p
 from crossgrad_core.scene.self_check.verdict import Cause, Verdict, verdict_of
 from crossgrad_core.scene.wording import count, name_some
 
-#: Poses are equal if their numbers differ by less than this, in local units.
+#: Poses are equal if their elements differ by less than this, in local units.
 _SAME_POSE: Final = 1e-9
 #: Points beyond this many times the median distance from the cameras count as infinitely far.
 _INFINITE: Final = 1e4
@@ -33,7 +33,7 @@ _ALMOST: Final = 0.5
 #: from the median brightness by more than this many stops.
 _BLURRED: Final = 0.15
 _STOPS: Final = 4.0
-#: No median is computed for fewer photos.
+#: With fewer photos than this, no median is computed.
 _FEWEST_PHOTOS: Final = 5
 #: Sharpness is the difference of neighbouring pixels divided by the difference of pixels at this
 #: distance.

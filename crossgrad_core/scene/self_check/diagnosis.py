@@ -16,13 +16,13 @@ from crossgrad_core.scene.self_check.evidence import (
     Rig,
 )
 
-#: Cameras that are used in trials.
+#: Number of cameras that are used in trials.
 MOST_CAMERAS: Final = 12
 #: A camera without tracks counts as seeing nothing if fewer points are in its frame.
 _FEWEST_UNTRACKED: Final = 3 * FEWEST
 #: A later trial must score higher by this much than an earlier, simpler trial.
 _CLEARLY: Final = 0.03
-#: A probe must score higher by this much than the unchanged scene.
+#: A changed scene must score higher by this much than the unchanged scene.
 _PROBED: Final = 0.01
 #: Number of times that the step of a search is halved.
 _ROUNDS: Final = 4
@@ -34,7 +34,8 @@ _POSES: Final = "convert the poses of the model to OpenCV axes (x right, y down,
 _PHOTOS: Final = "restore the photos that the poses were estimated from"
 _FLIP: Final = np.diag([1.0, -1.0, -1.0])
 _AXES: Final = "xyz"
-#: Step of a factor's logarithm; step and reach of the principal point, in shares of the photo.
+#: Step of the logarithm of a factor. Step and maximum offset of the principal point, as shares of
+#: the photo.
 _FACTOR: Final = 0.04
 _OFF: Final = 0.05
 _MOST_OFF: Final = 0.5
@@ -361,8 +362,8 @@ def _scaled(factor: float) -> Trial:
     return Trial(
         f"points and camera positions have different units: {factor:.3g} times the points fit",
         "write points and camera positions in the same units",
-        # Scaling the depth gives the same image as scaling the points, and each camera may have its
-        # own factor.
+        # Scaling the depth gives the same image as scaling the points. Each camera may have its own
+        # factor.
         lambda rig: replace(rig, translations=rig.translations / factor),
     )
 

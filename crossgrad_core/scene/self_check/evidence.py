@@ -15,9 +15,9 @@ from crossgrad_core.contract.scene import Scene
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
-#: Photos as they are, neither turned nor mirrored.
+#: The orientation of unchanged photos, which are neither rotated nor mirrored.
 UPRIGHT: Final = np.eye(2)
-#: A correlation is not computed for fewer observations.
+#: With fewer observations than this, no correlation is computed.
 FEWEST: Final = 8
 #: Minimum number of observations if the colours of points come from other photos.
 FEWEST_OF_PHOTOS: Final = 24
@@ -25,7 +25,7 @@ FEWEST_OF_PHOTOS: Final = 24
 MOST_OBSERVED: Final = 64
 #: Maximum number of points per camera in trials.
 MOST_TRIED: Final = 2_000
-#: Minimum number of tested points for each photo without tracks.
+#: Minimum number of points that are tested in each photo without tracks.
 _TESTED: Final = 1_500
 #: A point is hidden if another point in its cell is nearer by this factor.
 _HIDES: Final = 1.15
@@ -35,8 +35,8 @@ _IN_A_CELL, _CELLS = 6, 64
 FLAT: Final = 4.0
 Booleans: TypeAlias = NDArray[np.bool_]
 Photo: TypeAlias = tuple[NDArray[np.uint8], Booleans | None]
-#: Function that decodes the photo of a view: [H, W, 3] uint8, and [H, W] bool if some pixels are
-#: masked.
+#: Function that decodes the photo of a view. It returns the pixels [H, W, 3] uint8 and, if some
+#: pixels are masked, the mask [H, W] bool.
 Pixels: TypeAlias = Callable[[int], Photo]
 
 

@@ -36,25 +36,26 @@ _MOST_BAD: Final = 0.6
 _BAD: Final = 0.33
 #: A pose is wrong if less than this share of its observed points is in frame.
 _IN_FRAME: Final = 0.5
-#: A photo is tested as a suspect if its correlation is below this share of that of the better
-#: photos. A change or another photo fits a pose if its score is higher by this difference.
+#: A photo is tested as a suspect if its correlation is below this share of the correlation of the
+#: better photos. A change or another photo fits a pose if its score is higher by this difference.
 _SUSPECT: Final = 0.65
 _FITS_BETTER: Final = 0.25
-#: Photos used for comparison if most photos disagree, and suspects that are tested.
+#: Maximum number of photos used for comparison if most photos disagree, and maximum number of
+#: tested suspects.
 _MOST_COMPARED: Final = 64
 _MOST_SUSPECTS: Final = 32
 #: A photo fits if it reaches this share of the correlation of the better photos.
 _FITS: Final = 0.7
-#: Up to this number of photos, only mirrored and rotated copies are tested, because some other
-#: change would fit by chance.
+#: If there are at most this many photos, only mirrored and rotated copies are tested, because
+#: another change could fit by chance.
 _FEW: Final = 2
-#: Minimum number of points in frame of a photo that is compared with others or has no tracks.
+#: Minimum number of points in frame of a photo that has no tracks or is compared with other photos.
 _FEWEST_TESTED: Final = 3 * FEWEST
-#: A photo without tracks disagrees if its correlation is this many standard errors below the bound.
+#: A photo without tracks disagrees if its correlation is this many standard errors below the limit.
 _ERRORS: Final = 3.0
 #: Number of points that are tested in all photos of a scene without tracks.
 _MOST_TESTED: Final = 300_000
-#: The better photos are the upper quartile.
+#: The better photos are those above this quantile of the correlation.
 _BETTER: Final = 0.75
 #: Photos with a lower score are also tested with the likely changes of all cameras.
 _SURE: Final = 0.75
@@ -134,7 +135,8 @@ def verdict_of(scene: Scene, views: Sequence[int], pixels: Pixels) -> Verdict:
         )
     has_tracks = np.array([len(scene.views[view].seen) >= FEWEST for view in views])
     rows = np.asarray(views, dtype=np.int64)
-    # If some photos have tracks, photos without tracks are skipped: hidden points would mislead.
+    # If some photos have tracks, skip the photos without tracks, because hidden points would give
+    # wrong results.
     if has_tracks.any():
         rows = rows[has_tracks]
         return _Group.of(observed(scene, rows, pixels), rows).verdict()
@@ -199,7 +201,8 @@ class _Group:
         unlike = low & (
             np.nan_to_num(noise) > typical_noise * (1.0 - min(self.better, 0.99) ** 2) ** -0.25
         )
-        if self.recolored:  # Colours from a few other photos are not reliable enough.
+        # Colours that come from only a few other photos are not reliable enough.
+        if self.recolored:
             unlike[:] = False
         if not self.evidence.tracked:
             error = 1.0 / np.sqrt(np.maximum(self.agreement.inside, 1))
@@ -362,7 +365,7 @@ class _Group:
             evidence = self.evidence.chosen(np.full(len(others), row))
             agreement = evidence.agreement(replace(evidence.rig, photos=others))
             fit = scores(agreement, tracked=self.evidence.tracked)
-            # With many candidate photos, one may fit a few points by chance.
+            # With many candidate photos, a photo may fit by chance if it contains few points.
             fit[(others == self.views[row]) | (agreement.inside < _FEWEST_TESTED)] = 0.0
             if self._fits(fit.max(keepdims=True), np.array([row]))[0]:
                 fitting.append(row)

@@ -48,7 +48,7 @@ def sample_gradients(views: int, seed: int = 0) -> list[Gradients]:
     gradients: list[Gradients] = [
         {name: gradient(shape) for name, shape in _SHAPES.items()} for _ in range(views)
     ]
-    # The last view does not see the network, except if it is the only view.
+    # The last view gives no gradient to the network, except if it is the only view.
     if views > 1:
         gradients[-1] |= {"net.weight": None, "net.bias": None}
     return gradients

@@ -106,7 +106,7 @@ def global_randomness_untouched() -> Iterator[None]:
 
 
 def _global_states() -> dict[str, object]:
-    algorithm, keys, *rest = np.random.get_state()  # noqa: NPY002 - watched, not used
+    algorithm, keys, *rest = np.random.get_state()  # noqa: NPY002 - only the state of the generator is read
     return {
         "numpy": (algorithm, np.asarray(keys).tobytes(), tuple(rest)),
         "torch": torch.get_rng_state().numpy().tobytes(),

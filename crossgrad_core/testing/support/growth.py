@@ -17,10 +17,11 @@ from torch import Tensor
 from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.testing.support.contract import require
 
-#: Number of steps before the first measurement; a state that does not grow is complete by then.
+#: Number of steps before the first measurement. Within these steps, a state of fixed size reaches
+#: its full size.
 _FEW = 16
-#: Length of each of the three further windows; states with a shorter history have stopped growing
-#: by then.
+#: Number of steps in each of the three later windows. A state with a shorter history has stopped
+#: growing by then.
 _WINDOW = 1000
 
 
@@ -97,7 +98,7 @@ def _tensors() -> int:
     gc.collect()
     storages = {}
     for candidate in gc.get_objects():
-        # `isinstance` is avoided, because some objects answer it with warnings.
+        # Do not use `isinstance`, because it makes some objects emit warnings.
         if issubclass(type(candidate), Tensor) and not candidate.is_sparse:
             storage = candidate.untyped_storage()
             storages[storage.data_ptr()] = storage.nbytes()

@@ -21,7 +21,8 @@ from crossgrad_core.registry.entries import build
 from crossgrad_core.testing.fixtures import sample_camera, sample_gaussians, sample_scene
 from crossgrad_core.testing.support.contract import Check, ContractError, Make, cannot_tell, require
 
-#: Largest difference of a pixel from the reference: a few Gaussians at the edge of their footprint.
+#: Largest difference of a pixel from the reference. It occurs if a few Gaussians differ at the edge
+#: of their footprint.
 _PIXEL = 0.02
 #: Largest mean difference of pixels, and relative difference of gradients, from the reference.
 _MEAN, _GRADIENT = 2e-4, 2e-2
@@ -130,7 +131,8 @@ def _options() -> Iterator[_Case]:
     yield _Case("option max_alpha = 0.5", opaque, options={"max_alpha": 0.5})
     yield _Case("option dilation = 2", gaussians, options={"dilation": 2.0})
     depths = _depths(gaussians, camera).sort().values
-    # Put the value into the widest gap, so that rounding moves no centre to the other side.
+    # Choose the value inside the widest gap between depths, so that rounding cannot move a Gaussian
+    # to the other side.
     inner = slice(len(depths) // 4, 3 * len(depths) // 4)
     gaps = depths.diff()[inner]
     widest = int(gaps.argmax()) + len(depths) // 4
@@ -209,7 +211,7 @@ def _require_pixels(
 ) -> None:
     require(name in drawn, f"{case}: render gives no {name}")
     error, lost = (drawn[name] - expected).abs(), (rounded - expected).abs()
-    # The depth error of a Gaussian at its edge is proportional to its distance.
+    # At the edge of a Gaussian, the depth error is proportional to the distance of the Gaussian.
     size = max(1.0, float(expected.abs().max()))
     most = _PIXEL * size + _ROUNDINGS * float(lost.max())
     mean = _MEAN * size + _ROUNDINGS * float(lost.mean())
@@ -265,7 +267,7 @@ def its_options_are_heeded(make: Make[Rasterizer]) -> None:
         try:
             changed = type(rasterizer).model_validate({**rasterizer.model_dump(), **case.options})
         except ValidationError:
-            continue  # The rasterizer supports one value only and reports this.
+            continue  # The rasterizer reports that it supports only one value.
         tried += 1
         _require_same(changed, case)
     if not tried:

@@ -21,7 +21,7 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state
 from crossgrad_core.wording import listed
 
-#: Upper limit of losses; losses of images in [0, 1] are far below it.
+#: Upper limit of losses. Losses of images in [0, 1] are far below this limit.
 _LARGEST_LOSS = 10.0
 
 

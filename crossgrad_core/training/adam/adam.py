@@ -22,12 +22,12 @@ Update: TypeAlias = tuple[Tensor, Tensor, Tensor, Tensor, Coefficients]
 
 
 @torch.no_grad()
-def adam_step(  # noqa: PLR0913 - the step of an optimizer without an object that holds its options
+def adam_step(  # noqa: PLR0913 - all options of an optimizer step are arguments
     params: Mapping[str, Tensor],
     grads: Mapping[str, Tensor | None],
     state: AdamState,
     lrs: Mapping[str, float],
-    rule: AdamRule = AdamRule(),  # noqa: B008 - a frozen value
+    rule: AdamRule = AdamRule(),  # noqa: B008 - the default is a frozen object
     scales: Mapping[str, float] | None = None,
     *,
     from_zero: Collection[str] = (),
@@ -56,7 +56,7 @@ def adam_step(  # noqa: PLR0913 - the step of an optimizer without an object tha
     """
     _check(params, grads, rule.betas)
     given = {name: grad for name in params if (grad := grads.get(name)) is not None}
-    # Look it up before the first step is counted.
+    # Look up the coefficients before the first step is counted.
     numbers = {name: (lrs[name], 1.0 if scales is None else scales[name]) for name in given}
     updates = []
     for name, grad in given.items():
@@ -111,7 +111,7 @@ def update_tensors(updates: Iterable[Update]) -> None:
 def _update_fused(updates: Sequence[Update]) -> None:
     from crossgrad_core.training.adam.numba_kernels.fused import update_at
 
-    # Keep references until the step is done; otherwise the copies would be freed too early.
+    # Keep references until the step is done. Otherwise, the copies would be freed too early.
     laid_out = [(p, g.contiguous(), m, v) for p, g, m, v, _ in updates]
     addresses = [[tensor.data_ptr() for tensor in four] for four in laid_out]
     sizes = [param.numel() for param, *_ in laid_out]
@@ -139,7 +139,7 @@ def update_on_gpu(
         [exp_avg],
         [exp_avg_sq],
         [],
-        # The function adds 1 first.
+        # The function adds 1 to the step count first.
         [torch.full((), step.age - 1, dtype=torch.float32, device=param.device)],
         fused=True,
         amsgrad=False,

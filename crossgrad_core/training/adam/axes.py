@@ -15,7 +15,7 @@ from torch import Tensor
 from crossgrad_core.gradients.columns import is_native
 from crossgrad_core.numerics.rotations import rotation_matrices
 
-#: Largest ratio, in either direction, of an axis length to the typical axis length.
+#: Maximum ratio of an axis length to the typical axis length. The inverse ratio has the same limit.
 LIMIT: Final = 5.0
 #: Largest number of Gaussians that are sampled for the typical length.
 _SAMPLE = 1024
@@ -64,9 +64,9 @@ def _usual(scales: Tensor) -> Tensor | float:
     Non-finite values are left out, so that they do not affect other Gaussians.
     """
     sample = scales[:: -(-len(scales) // _SAMPLE)]
-    if is_native([sample]):  # NumPy has less overhead than torch.
+    if is_native([sample]):  # Use NumPy, because it has less overhead than torch.
         rows = sample.numpy()
-        # NaN comes last, as in torch's sort.
+        # Sort NaN to the end, as torch does.
         a, b, c = np.where(np.isnan(rows), np.float32(inf), rows).T
         lengths = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
         lengths = lengths[np.isfinite(lengths)]

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from math import sqrt
 
 # Gradients and first moments below this count as 0, because they would become subnormal during
-# decay. With eps = 1e-15 they move a parameter by less than 1e-14 of its learning rate.
+# decay. With eps = 1e-15, smaller values move a parameter by less than 1e-14 of its learning rate.
 TINY = 1e-30
 
 
@@ -13,8 +13,8 @@ TINY = 1e-30
 SMALLEST_NORMAL = 2.0**-126
 
 
-# Gradients are clamped to this size, because the square of a larger one overflows float32 and an
-# infinite second moment would stop its parameter for good.
+# Gradients are clamped to this magnitude. The square of a larger gradient overflows float32, and an
+# infinite second moment would stop its parameter permanently.
 LARGEST = 1e18
 
 

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 #: Largest number of deferred steps of a row, so that tables stay short.
 LONGEST: Final = 256
-#: Share of the rows from which on all rows take the step, in memory order, because deferred updates
-#: would take longer.
+#: If at least this share of the rows takes a step, all rows take it in memory order, because
+#: deferred updates would take longer.
 MOST_ROWS: Final = 0.15
 #: With a smaller beta2, second moments may vanish before the kernel checks again.
 LEAST_BETA2: Final = 0.5
@@ -61,12 +61,12 @@ class _Behind:
     def table(self) -> NDArray[np.float32]:
         """The steps as a flat table for the kernel."""
         steps = self.room[: self.count]
-        # Upper and lower bounds over this and all later steps.
+        # Upper and lower bounds over each step and all later steps.
         later = steps[::-1]
         most = np.maximum.accumulate(later[:, 2])[::-1]
         least = np.minimum.accumulate(later[:, 3])[::-1]
-        # The bound is valid only if the first moment decays faster than the root of the second, and
-        # the second stays a normal number between two checks.
+        # The bound is valid under two conditions: the first moment decays faster than the root of
+        # the second moment, and the second moment stays a normal number between two checks.
         beta1, beta2 = steps[:, 0], steps[:, 1]
         fades = bool(((beta1 <= np.sqrt(beta2)) & (beta2 >= LEAST_BETA2)).all())
         most = most if fades else np.full_like(most, inf)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import kernel
 
-#: A pixel counts if at least this share of its area counts.
+#: A pixel of the smaller image counts if at least this share of its area counts.
 _COUNTS = 0.5
 
 

@@ -15,7 +15,7 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: Name of the state, which is kept between steps and in checkpoints.
+#: Name of the plugin state. It is kept between steps and in checkpoints.
 STATE = "clip"
 
 
@@ -33,7 +33,7 @@ class Clip(Observer):
         gradients, clipped = dict(aggregated.gradients), 0
         for block in context.blocks:
             present = {name: g for name in block.tensors if (g := gradients[name]) is not None}
-            # The tensors of a block count as one vector.
+            # The clipping treats the tensors of a block as one vector.
             norm = sqrt(sum(float(gradient.square().sum()) for gradient in present.values()))
             if norm > self.max_norm:
                 clipped += 1

@@ -13,8 +13,8 @@ from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.raw import RawScene, RawView
 
-#: Name of the pose file in a scene: a list of `{"name", "size": [w, h], "pinhole": [fx, fy, cx,
-#: cy], "world_to_camera": 4 x 4}`; photos are in the folder images/.
+#: Name of the pose file in a scene. The file contains a list of `{"name", "size": [w, h],
+#: "pinhole": [fx, fy, cx, cy], "world_to_camera": 4 x 4}`. The photos are in the folder images/.
 POSES = "poses.json"
 
 

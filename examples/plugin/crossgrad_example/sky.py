@@ -14,7 +14,8 @@ class Sky(Initializer):
 
     @override
     def more_points(self, scene: Scene) -> MorePoints | None:
-        # A spiral with equal areas: neighbouring points differ by the golden angle.
+        # Place the points on a spiral with equal areas, in which neighbouring points differ by the
+        # golden angle.
         height = (np.arange(self.count) + 0.5) / self.count
         angle = np.arange(self.count) * np.pi * (3.0 - np.sqrt(5.0))
         flat = np.sqrt(1.0 - height**2)

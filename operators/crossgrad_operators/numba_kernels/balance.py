@@ -47,10 +47,10 @@ STEPS = 200
 DECREMENT = 1e-13
 #: Below this Newton decrement, whole steps converge quadratically.
 CLOSE = 0.25
-#: If beta is above this, the bargaining problem diverges: 7e5 sqrt(K) is already zero by
-#: `CANCELLED`.
+#: The bargaining problem diverges if beta is above this value. A beta above 7e5 sqrt(K) already
+#: counts as zero by the limit `CANCELLED`.
 ENDLESS = 3e7
-#: Maximum number of final Newton steps with 32 digits. Two are enough up to a kappa of 1e5.
+#: Maximum number of final Newton steps with 32 digits. Two steps are enough up to a kappa of 1e5.
 POLISHING = 20
 
 
@@ -200,7 +200,7 @@ def _same_shares(
         sizes += abs(v[i, 0])
         largest = max(largest, abs(v[i, 0]))
         put(x, i, product(at(v, i), at(scaled, i), exact))
-    # The sum of the v, or of v times gradients, may consist only of rounding noise.
+    # The sum of v, or the sum of v times the gradients, may consist only of rounding noise.
     if total[0] * total[0] > CANCELLED * largest * largest and not cancels(x, cosines, exact):
         for i in range(n):
             weights[places[i]] = quotient(at(v, i), total, exact)[0]
@@ -252,7 +252,7 @@ def bargain(cosines: Floats, beta: Floats) -> bool:
             beta[i] *= 1.0 + damping * step[i]
         if beta.max() > ENDLESS:
             return False
-        # After a full step the decrement is squared, until rounding stops the convergence.
+        # After a full step, the decrement is squared, until rounding stops the convergence.
         if decrement <= DECREMENT or decrement > 0.5 * last:
             return True
         last = decrement if decrement <= CLOSE else np.inf
@@ -309,7 +309,8 @@ def geometric_mean(values: Floats) -> float:
         exponent += power
     n = values.size
     whole = exponent // n
-    # The remaining exponent, from 0 to n - 1, stays under the root.
+    # The remaining exponent is between 0 and n - 1. The root is taken of the mantissa with this
+    # exponent.
     return math.ldexp(math.ldexp(mantissa, exponent - whole * n) ** (1.0 / n), whole)
 
 
@@ -330,7 +331,8 @@ def nash(
         if n == 0 or not _bargained(cosines, beta, exact):
             continue
         largest = beta.max()
-        # |u|^2 is n, and errors of the cosines grow with the summands over |u|.
+        # |u|^2 is n. The effect of errors in the cosines is proportional to the largest summand
+        # divided by |u|.
         ill_conditioned[b] = n > 1 and CAUTION * n * EPSILON * max(largest / np.sqrt(n), 1.0) > unit
         if n > 1 and n <= CANCELLED * largest * largest:
             continue
@@ -356,7 +358,8 @@ def aligned(
         n = places.size
         if n == 0:
             continue
-        # Eigenvalues of D C D have the same relative errors as the eigenvalues of C.
+        # D C D, the matrix scaled by the norms, has eigenvalues with the same relative errors as
+        # the eigenvalues of C.
         pivot = smallest_pivot(cosines[:, :, 0].copy(), n)
         ill_conditioned[b] = n > 1 and CAUTION * n * EPSILON > unit * pivot
         matrix, vectors = _graded(norms, cosines, exact), np.empty((n, n, 2))
@@ -370,7 +373,8 @@ def aligned(
         ones[:, 0] = 1.0
         for i in kept:
             inner = products(vectors[:, i], ones, 0, n, exact)
-            # Skip eigenvectors orthogonal to p, which would contribute only rounding noise.
+            # Skip eigenvectors that are orthogonal to p, because they would contribute only
+            # rounding noise.
             if abs(inner[0]) > OPPOSITE:
                 ratio = quotient(at(matrix[least], least), at(matrix[i], i), exact)
                 factor = product(root(ratio, exact), inner, exact)

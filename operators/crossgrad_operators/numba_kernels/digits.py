@@ -23,7 +23,7 @@ from crossgrad_core.numerics.jit import strict_device, strict_part
 
 Pair = tuple[float, float]
 Exact = Literal[True] | None
-#: [n, 2] numbers, or [n, n, 2].
+#: Arrays [n, 2] or [n, n, 2]. The last dimension holds the two parts of a number.
 Pairs = NDArray[np.float64]
 ONE: Final = (1.0, 0.0)
 

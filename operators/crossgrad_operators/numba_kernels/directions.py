@@ -22,7 +22,7 @@ from crossgrad_operators.numba_kernels.polyhedron import Polyhedron, share_left,
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-#: Weights, and True for blocks whose weights may change with more digits.
+#: The weights, and True for each block whose weights may change with more digits.
 Solved = tuple[Floats, Flags]
 
 

@@ -12,7 +12,7 @@ from crossgrad_operators.numba_kernels.normal import (
     Indices,
 )
 
-#: A norm has reached its target if it is this close to it, relative to the mean norm.
+#: A norm has reached its target if their difference is at most this share of the mean norm.
 MET = 1e-9
 
 

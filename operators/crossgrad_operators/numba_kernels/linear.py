@@ -20,14 +20,16 @@ from crossgrad_operators.numba_kernels.digits import (
 from crossgrad_operators.numba_kernels.normal import Floats, Indices
 
 #: Smallest pivot of a Cholesky factor of cosines. Smaller pivots are rounding noise of a singular
-#: matrix. The null vector, which callers look for, then dominates the solution.
+#: matrix. With this minimum, the null vector, which callers look for, dominates the solution.
 PIVOT = 1e-15
 
-#: Maximum number of Jacobi sweeps. Six are enough for 16 rows, and eight with 32 digits.
+#: Maximum number of Jacobi sweeps. For 16 rows, six sweeps are enough, or eight sweeps with 32
+#: digits.
 SWEEPS = 30
-#: With 32 digits, off-diagonal elements up to this share of the diagonal ones count as zero.
+#: With 32 digits, off-diagonal elements count as zero up to this share of the diagonal elements.
 NEGLIGIBLE = 1e-31
-#: Elements up to this share of the largest element also count as zero. Its square is not zero.
+#: Elements also count as zero up to this share of the largest element. The square of this share is
+#: not zero in float64.
 VANISHING = 1e-140
 
 

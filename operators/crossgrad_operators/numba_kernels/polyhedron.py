@@ -37,12 +37,12 @@ from crossgrad_operators.numba_kernels.digits import (
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.int64]
 
-#: Maximum number of proximal steps, each from the previous result.
+#: Maximum number of proximal steps. Each step starts from the previous result.
 ROUNDS = 3
-#: If a pivot (square of a sine) is at most this, 16 digits may be inaccurate.
+#: If a pivot (the square of a sine) is at most this value, 16 digits may be inaccurate.
 ILL_CONDITIONED = 1e-6
-#: Maximum number of changes of the active set, per view and round. Observed runs needed at most a
-#: sixth of it.
+#: Maximum number of changes of the active set, per view and round. In observed runs, at most a
+#: sixth of this number was needed.
 CHANGES = 12
 
 

@@ -97,7 +97,8 @@ def projected(
         exact: True for 32 digits, None for 16.
     """
     threshold, strength = rule
-    # Without a threshold the rule is continuous, so the sign of zero does not matter.
+    # With a threshold of 0, the rule is continuous. The sign of a cosine near zero then does not
+    # matter, and no margin is needed.
     margin = 0.0 if threshold == 0.0 else OPPOSITE
     least = plus((threshold, 0.0), (margin, 0.0), exact)
     blocks, views, _ = gramians.shape

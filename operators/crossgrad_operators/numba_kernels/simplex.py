@@ -55,14 +55,15 @@ from crossgrad_operators.numba_kernels.polyhedron import (
 
 #: Maximum number of levels that are tried. About five are usual.
 LEVELS = 60
-#: The level is accepted if the active constraints do not change, and if its change is at most this
-#: share or reverses. The next rounds correct the remaining error.
+#: A level is accepted if the active constraints do not change and its change is small or reversed.
+#: A change is small if it is at most this share of the level. The next rounds correct the remaining
+#: error.
 CLOSE = 1e-6
-#: Directions may cancel if the ridge adds more than this share of rho^2 to the distance.
+#: If the ridge adds more than this share of rho^2 to the distance, the directions may cancel.
 HELD_BY_RIDGE = 1e-5
-#: Two squared distances are equal if their relative difference is at most this value.
+#: Two squared distances count as equal if their relative difference is at most this value.
 TIE = 1e-9
-#: Smallest square of the sine between two gradients that are combined.
+#: Two gradients are combined only if the square of the sine between them is at least this value.
 PIVOT = 1e-15
 
 
@@ -179,7 +180,8 @@ def _change(problem: Polyhedron, count: int, search: Search, level: Pair, ridge:
     for i in range(count):
         k = problem.chosen[i]
         y, a, r = at(problem.y, k), at(slope, k), at(search.r, k)
-        # On the active face, C y + q - level r + ridge (y - centre) = 0, which gives C y and C a.
+        # On the active face, C y + q - level r + ridge (y - centre) = 0. This equation gives C y
+        # and C a.
         pull = minus((ridge * y[0], ridge * y[1]), (ridge * problem.centre[k, 0], 0.0), exact)
         force = minus(product(level, r, exact), plus(at(search.q, k), pull, exact), exact)
         turn = minus(r, (ridge * a[0], ridge * a[1]), exact)
@@ -250,7 +252,8 @@ def _reach(problem: Polyhedron, search: Search) -> None:
     level = (_limits(search)[1], 0.0)
     for turn in range(ROUNDS):
         copy(problem.y, problem.centre)
-        # In the first round the ridge counts as part of the directions, so nothing cancels.
+        # In the first round, the ridge counts as a part of the directions, so the directions do not
+        # cancel.
         ridge = problem.rounding.ridge if turn > 0 else 0.0
         level = _find_level(problem, search, level, ridge)
         if is_settled(problem) or share_left(problem, problem.y) == 0.0:

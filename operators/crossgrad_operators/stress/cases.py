@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 Rows = NDArray[np.float64]
-#: Elements of the largest cases, and elements of the largest case without repetition.
+#: Number of elements of the largest cases, and number of elements of the largest case that repeats
+#: no elements.
 LARGE = 10_000_000
 EXACT = 10_000
 
@@ -191,7 +192,7 @@ def _not_finite() -> Iterator[Case]:
 def _many_views() -> Iterator[Case]:
     for views in (1, 3, 4, 5, 8, 12, 16):
         yield short(f"K = {views}", _rng(20 + views).standard_normal((views, 40)))
-    # Pairwise cosines are about -0.04, so each view conflicts with all other views.
+    # The cosines of all pairs are about -0.04, so each view conflicts with all other views.
     rows = _centred(_rng(40).standard_normal((16, 60)))
     yield short("K = 16, all conflict", rows)
     rows = _rng(41).standard_normal((8, 40)) * 10.0 ** np.linspace(0, 12, 8)[:, None]

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 #: Default number of elements of the largest gradients.
 LARGE = 10_000_000
-#: Option -> the kinds of run that use it. "" means the fixed cases.
+#: Option -> kinds of runs that use it. The kind "" stands for the fixed cases.
 _USED: Final[Mapping[str, tuple[str, ...]]] = {
     "--case": ("",),
     "--elements": ("",),

@@ -15,13 +15,14 @@ from crossgrad_operators.stress.cases import Case, Rows
 Number: TypeAlias = Any
 Matrix: TypeAlias = list[list[Number]]
 DIGITS = 50
-#: Exponent range of products of float64 numbers in binary digits. Sums with this precision are
-#: exact.
+#: Range of the exponents of products of float64 numbers, in binary digits. Sums with this precision
+#: are exact.
 _RANGE = 4300
 Vector = list[Number]
-#: Pivots below this relative size count as zero. Exactly singular matrices have about 1e-50.
+#: Pivots below this relative size count as zero. The pivots of exactly singular matrices are about
+#: 1e-50.
 SINGULAR = "1e-35"
-#: Multiple of a direction that is large enough for some entry to reach zero first.
+#: Factor for a direction. It is so large that an entry reaches zero before the end of the step.
 FAR = 10**30
 
 
@@ -164,7 +165,8 @@ def _settle(
     while active:
         target = solve(matrix, sorted(active), [-o for o in offset])
         if target is None:
-            # The new column depends on the other columns, so x can move along the null vector.
+            # The new column is a combination of the other columns, so x can move along the null
+            # vector.
             rest = sorted(active - {entered})
             along = solve(matrix, rest, [-row[entered] for row in matrix])
             if along is None or all(v >= 0 for v in along):

@@ -21,9 +21,10 @@ from crossgrad_operators.stress.exact import (
     require_mpmath,
 )
 
-#: Two directions with 1 + cos up to this value are exactly opposite.
+#: Two directions count as exactly opposite if 1 + cos is at most this value.
 OPPOSITE = "1e-12"
-#: Two directions with |cos| up to this value are unrelated: cancelling sums have such an error.
+#: Two directions count as unrelated if |cos| is at most this value. Sums that cancel have an error
+#: of this size.
 UNRELATED = "1e-14"
 
 
@@ -171,7 +172,7 @@ def _projected_row(
     rule: tuple[Number, Number],
 ) -> Vector:
     threshold, strength = rule
-    # A cosine exactly at the threshold, where the rule jumps, is not a conflict.
+    # A cosine that is exactly at the threshold, where the rule has a jump, is not a conflict.
     least = threshold + (number(OPPOSITE) if threshold else 0)
     norms = lengths(question.gramian)
     row = _Combination(question.gramian, norms, i)

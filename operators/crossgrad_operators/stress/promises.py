@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from crossgrad_operators.stress.exact import Matrix, form, number, pivots
 from crossgrad_operators.stress.solvers import shortest
 
-#: Relative error that is guaranteed inside the set, in units of u kappa.
+#: Guaranteed relative error inside the set, in units of u kappa.
 PROMISED: Final = 8.0
 #: Unit roundoff of float64.
 FLOAT64: Final = 2.0**-53
@@ -27,14 +27,15 @@ DETERMINED: Final = 0.1
 #: Directions with a pivot between these values are nearly dependent.
 DEPENDENT: Final = 1e-29
 INDEPENDENT: Final = 1e-13
-#: Upper limit of such pivots for methods that divide by every eigenvalue.
+#: Upper limit of the pivots of nearly dependent directions, for methods that divide by every
+#: eigenvalue.
 REGULAR: Final = 1e-8
-#: Amount that rounding may add to a bound of 1.
+#: Rounding may increase a bound of 1 by this amount.
 SLIGHTLY: Final = 1e-3
-#: Ratio of norms up to which CAGrad can distinguish cancelling directions from other directions.
+#: CAGrad can distinguish cancelling directions from other directions up to this ratio of norms.
 COMPARABLE: Final = 1e8
-#: Solutions are continuous if the distance of zero from the hull of the directions is at least
-#: this.
+#: Solutions are continuous if the distance from the origin to the convex hull of the directions is
+#: at least this value.
 APART: Final = 1e-7
 
 
@@ -109,7 +110,7 @@ class Facts:
 
         The value bounds the rounding errors of all products and additions, in units of u kappa.
         """
-        # Scale by the largest term, because its square may overflow in float64.
+        # Divide by the largest term, because its square may overflow in float64.
         unit = self.largest or 1.0
         terms = self.weights * self.norms / unit
         cosines = np.array(self.cosines, dtype=np.float64).reshape(len(terms), len(terms))
@@ -207,7 +208,7 @@ class Promise:
     continuous: Callable[[Facts], bool] = everywhere
 
 
-#: Guarantee for operators without their own guarantee.
+#: Guarantee for operators that have no guarantee of their own.
 ALL: Final = Promise("all gradients", "infinity", lambda _views: float("inf"), everywhere)
 _DETERMINED: Final = "all Gramians with kappa u <= 0.1, and those whose exact result is zero"
 _CLEAR: Final = (

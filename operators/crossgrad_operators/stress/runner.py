@@ -30,7 +30,7 @@ BLOCK = Block("means", ("means",), False, "geometry", LearningRate(1.0))
 REPEATED = 100_000
 #: Number of steps for operators with memory.
 STEPS = 3
-#: Failure reason if the reference finds no proven answer.
+#: Reason of a failure if the answer of the reference is not proven.
 UNPROVEN = "the reference is not proven"
 
 
@@ -101,7 +101,7 @@ def judged(
         try:
             result, state, seconds = timed(operator, exact.case, views, state)
         except Exception as error:
-            # Third-party code may raise anything.
+            # Operators of other packages may raise any exception.
             return Finding("failed", reason=f"{type(error).__name__}: {error}"), []
         times.append(seconds)
         finding = compared(exact, result, reference, views, memory)

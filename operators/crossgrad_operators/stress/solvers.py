@@ -34,14 +34,17 @@ from crossgrad_operators.stress.oracles import (
     zeros,
 )
 
-#: Digits for matrices whose eigenvalues differ by 60 decades.
+#: Number of digits for matrices whose eigenvalues differ by 60 decades.
 WIDE: Final = 150
-#: Newton decrement and maximum beta for the start in float64.
+#: The first solution, in float64, ends at this Newton decrement or if a beta reaches the second
+#: value.
 ROUGH: Final = 1e-3
 LONG: Final = 1e7
-#: Ratio of eigenvalues above which float64 determines the rank without doubt.
+#: If the smallest eigenvalue divided by the largest is above this value, float64 determines the
+#: rank without doubt.
 FAR: Final = 1e-10
-#: A sum is zero if |sum x_k e_k|^2 over the largest x_k^2 is at most this, in 50 digits.
+#: A sum counts as zero if |sum x_k e_k|^2 divided by the largest x_k^2 is at most this value, in 50
+#: digits.
 VANISHED = "1e-45"
 #: Maximum number of levels that are tried for CAGrad.
 LEVELS = 400
@@ -63,7 +66,8 @@ def imtl_g(question: Question) -> Vector:
         return zeros(2) if opposite else [n[1] / total, n[0] / total]
     v = _equal_projections(gramian, n, cosine)
     total, largest = sum(v), max(abs(x) for x in v)
-    # The sum of the v is in the denominator, so it counts as zero by the rule for cancelling sums.
+    # The sum of all elements of v is in the denominator. It counts as zero by the rule for
+    # cancelling sums.
     if cancels(total**2, largest) or is_noise(cosine, [x * y for x, y in zip(v, n, strict=True)]):
         return zeros(count)
     return [x / total for x in v]
@@ -75,7 +79,8 @@ def _equal_projections(gramian: Matrix, n: Vector, cosine: Matrix) -> Vector:
         v = solve(cosine, range(count), [number(1)] * count)
         if v is not None:
             return [x / y for x, y in zip(v, n, strict=True)]
-    # Use more digits: the largest eigenvalue may exceed the smallest by 60 decades.
+    # Use more digits, because the largest eigenvalue may exceed the smallest eigenvalue by 60
+    # decades.
     with require_mpmath().mp.workdps(WIDE):
         return _shortest_solution(gramian, n, rank)
 
@@ -84,7 +89,7 @@ def _rank(cosine: Matrix) -> int:
     """Return the number of eigenvalues above 1e-12 of the largest."""
     mp = require_mpmath().mp
     rough = np.linalg.eigvalsh(np.array(cosine, dtype=np.float64))
-    # float64 is accurate to 1e-14, which is enough if all eigenvalues are far above the limit.
+    # float64 is accurate to 1e-14. This is enough if all eigenvalues are far above the limit.
     if rough.min() > FAR * rough.max():
         return len(cosine)
     values, _ = mp.eigsy(mp.matrix(cosine))
@@ -98,7 +103,8 @@ def _shortest_solution(gramian: Matrix, n: Vector, rank: int) -> Vector:
     v = zeros(count)
     for i in largest:
         terms = [vectors[k, i] * n[k] for k in range(count)]
-        # Skip vectors orthogonal to the norms, because only rounding noise would be divided.
+        # Skip vectors that are orthogonal to the norms, because their terms would be rounding noise
+        # divided by an eigenvalue.
         if abs(sum(terms)) > number(OPPOSITE) * sum(abs(t) for t in terms):
             factor = sum(terms) / values[i]
             v = [a + factor * vectors[k, i] for k, a in enumerate(v)]
@@ -140,7 +146,7 @@ def _bargain(cosine: Matrix) -> Vector | None:
         decrement = mp.sqrt(abs(dot(slope, step)))
         damping = 1 if decrement < number("0.2") else 1 / (1 + decrement)
         beta = [b * (1 + damping * s) for b, s in zip(beta, step, strict=True)]
-        # This last step squared the remaining error.
+        # Stop at this decrement, because the last step has already squared the remaining error.
         if decrement < mp.mpf("1e-25"):
             return beta
     raise UnprovenError

@@ -157,7 +157,7 @@ def _judged(operator: Operator, law: Law) -> Finding:
     try:
         error = law(operator)
     except Exception as problem:
-        # Third-party code may raise anything.
+        # Operators of other packages may raise any exception.
         return Finding("failed", reason=f"{type(problem).__name__}: {problem}")
     if error is None:
         return Finding("refused")

@@ -20,15 +20,16 @@ from crossgrad_operators.stress.oracles import cosines, lengths
 from crossgrad_operators.stress.promises import ALL, Facts, Promise
 from crossgrad_operators.stress.reference import Answer
 
-#: Above this kappa u only finiteness is guaranteed, because the input does not determine the
-#: result.
+#: If kappa u is above this value, only finiteness is guaranteed, because the input does not
+#: determine the result.
 UNDETERMINED: Final = 0.1
 #: Failure reason of a result that contains a NaN or an infinity.
 NOT_FINITE: Final = "not finite"
 
 Verdict = Literal["ok", "undetermined", "outside", "refused", "failed"]
 
-#: Maximum distance of a result from the nearest result that a rule for elements allows.
+#: Function that returns the distance of a result from the nearest result that a rule for elements
+#: allows.
 ElementRule = Callable[[Case, Tensor], float]
 
 
@@ -149,7 +150,7 @@ def _outside(case: Case, found: Tensor, facts: Facts, promise: Promise) -> Findi
 
 def _measured(case: Case, error: float, sizes: tuple[float, float], bound: float) -> Finding:
     unit, (scale, length) = _unit(case), sizes
-    # The error of gradual underflow is absolute for each element, so subtract it.
+    # Gradual underflow causes an absolute error in each element, so subtract this error.
     lost = sqrt(case.size) * float(torch.finfo(case.dtype).smallest_normal) * unit
     error = max(error - lost, 0.0)
     measured = error / (unit * scale) if error else 0.0
@@ -165,7 +166,7 @@ def distance(case: Case, found: Tensor, expected: Answer) -> float:
     values = found.detach().double().numpy()
     head = case.head.shape[1]
     exact = weighted_sum(expected.weights, case.exact_head)
-    # Subtract in 50 digits. The differences then need few digits.
+    # Subtract in 50 digits, because the differences then need few digits.
     parts = [float(e - v) for v, e in zip(values[:head].tolist(), exact, strict=True)]
     if case.copies:
         pattern = np.array([float(v) for v in weighted_sum(expected.weights, case.exact_pattern)])

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 _WIDTH = 80
 _MARGIN = "  "
-#: Sections of docstrings that are not for users; options are listed separately with their bounds.
+#: Sections of docstrings that are not for users. Options and their bounds are listed separately.
 _SECTIONS = ("Attributes:", "Args:", "Returns:", "Raises:")
 _SIGNS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<", "multiple_of": "a multiple of"}
 _LENGTHS = {"min_length": "at least", "max_length": "at most"}
@@ -93,7 +93,7 @@ def _traits(component: "type[Component]") -> list[tuple[str, object]]:
         if attribute not in component.model_fields and hasattr(component, attribute):
             value = getattr(component, attribute)
             if isinstance(value, property):
-                continue  # The answer depends on the options.
+                continue  # The value depends on the options.
             value = sorted(value) if isinstance(value, frozenset) else value
             if value:
                 traits.append((label, listed(value) if isinstance(value, list | tuple) else value))

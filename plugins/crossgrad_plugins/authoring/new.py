@@ -20,7 +20,7 @@ from crossgrad_core.commands import (
     with_article,
 )
 
-#: Folders of the example package: in the wheel, else in the checkout.
+#: Possible folders of the example package: first in the wheel, then in the checkout.
 _EXAMPLES: Final = (
     Path(__file__).with_name("example"),
     Path(__file__).parents[3] / "examples" / "plugin",
@@ -122,7 +122,7 @@ def _contents(name: str, module: str, slot: str) -> dict[str, str]:
     }
     return {
         "pyproject.toml": _PROJECT.format(**words),
-        # The generator of a rule has the name under which the rule is installed.
+        # The random generator of a rule has the name under which the rule is installed.
         f"{module}.py": re.sub(rf"\b{model}\b", member, source).replace(
             f'rngs["{example.stem}"]', f'rngs["{name}"]'
         ),

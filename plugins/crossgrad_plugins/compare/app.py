@@ -107,7 +107,7 @@ def _unlike_pairs(arms: Mapping[str, Runs]) -> Iterator[tuple[Run, Run]]:
 
 
 _TEMPLATE: Final = Path(__file__).with_name("page.html")
-#: Number of table rows that are visible; a click shows further rows.
+#: Number of table rows that are visible. A click shows further rows.
 _OPEN_ROWS: Final = 12
 #: Series colours on a dark page: the same hues, lighter.
 _DARK: Final = ("#4fa8e0", "#f08a3c", "#2fc79b", "#e3a1c5", "#f0b93a", "#86c9f2", "#c2a04a")
@@ -237,7 +237,7 @@ def _lines(table: Table) -> Iterator[str]:
 
 #: Name of the default output folder, next to the runs.
 FOLDER: Final = "compare"
-#: Names of all figures that a comparison can draw.
+#: Names of all plots that a comparison can draw.
 DRAWINGS: Final = (
     *(f"curves_{cost.name}" for cost in COSTS),
     *("differences", "frontier", "phases", "primitives", "profile", "regimes"),
@@ -285,7 +285,7 @@ def compare(
     }
     write_files(folder, files, OWNED)
     for line in lines_of(comparison, notes):
-        print(one_line(line))  # noqa: T201 - the result of the command
+        print(one_line(line))  # noqa: T201 - print the result of the command
     shown, page = one_line(folder), one_line(folder / PAGE)
     print(f"\npage, figures and tables in {shown}: open {page}")  # noqa: T201
 

@@ -9,7 +9,8 @@ from typing import Final, TypeAlias
 from crossgrad_core.commands import UserError
 from crossgrad_plugins.compare.run import ABSENT, Run, Settings, text_of
 
-#: Settings that name an arm if they differ; other settings follow.
+#: Settings that come first in the names of arms, if they differ between the arms. Other settings
+#: follow.
 _FIRST: Final = (
     *("backbone", "views_per_step", "sampler", "operator", "densifier"),
     *("rate_factor", "densify_views", "schedule", "schedule_length", "schedule_unit"),
@@ -18,7 +19,7 @@ _FIRST: Final = (
 #: Settings that have a shorter name in the names of arms.
 _SPOKEN: Final = {"views_per_step": "views"}
 _DIGITS: Final = re.compile(r"(\d+)")
-#: Names of the settings for scene and seed.
+#: Name of a scene, and seed.
 Problem: TypeAlias = tuple[str, int]
 Length: TypeAlias = tuple[str, float]
 
@@ -74,7 +75,7 @@ def _grouped(runs: Sequence[Run]) -> list[tuple[str, list[Run]]]:
         arms = _by_labels(runs)
         if len({name for name, _ in arms}) == len(arms):
             return arms
-    # A run with two labels is listed twice.
+    # Keep a run only once, because a run with two labels is listed twice.
     return _by_settings(list({run.name: run for run in runs}.values()))
 
 

@@ -18,17 +18,19 @@ from crossgrad_plugins.compare.run import Run
 #: Pattern of the note on the photos' sizes that every run writes.
 _SIZES: Final = re.compile(r"^photos: (?P<sizes>\d.*?) from .*?/, (?P<how>.*)$")
 _MOST_SHOWN: Final = 3
-#: The definition that applies to every metric: how renders are compared.
+#: Key of the definition that applies to every metric, because it says how renders are compared.
 _RENDERS: Final = "renders"
-#: The environment fields that identify a machine; `_SHARE` says how the machine is used.
+#: The environment fields that identify a machine. The fields in `_SHARE` describe how much of the
+#: machine is used.
 _MACHINE: Final = {"cpu": "processor", "gpu": "GPU", "device": "device"}
 _SHARE: Final = {"cpu_cores": "number of cores", "torch_threads": "number of threads"}
-#: Allowed relative difference of the calibration rates: by wall clock, and in CPU time. CPU
-#: time varies more, because other processes share the caches and cores.
+#: Allowed relative difference of the calibration rates: by wall clock, and in CPU time. CPU time
+#: varies more than wall-clock time, because other processes share the caches and cores.
 _SAME_SPEED: Final = {"rate": 0.1, "cpu_rate": 0.25}
 #: A machine counts as busy if its mean load exceeds its number of cores by this amount.
 _BUSY: Final = 0.5
-#: Wall-clock seconds in notes; CPU seconds may still be compared.
+#: Name of wall-clock seconds in notes. CPU seconds can be compared even if wall-clock seconds
+#: cannot.
 _CLOCK: Final = "wall-clock seconds"
 _NEVER_RECORDED: Final = "no run recorded them"
 

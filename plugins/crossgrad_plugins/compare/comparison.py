@@ -22,7 +22,7 @@ from crossgrad_plugins.compare.ranking import Standing
 from crossgrad_plugins.compare.run import Run
 from crossgrad_plugins.compare.targets import is_inside, shared_amount, value_at
 
-#: Position at which the contrasts of the main table are taken: the end of the runs.
+#: The main table compares the arms at this position: the end of the runs.
 END = "at the end"
 OVERALL = "overall"
 #: With at most this many arms, every table has a row for every pair of arms.
@@ -138,7 +138,7 @@ class Comparison:
         """The contrasts of the main pairs, overall and by regime, on scenes with agreed regimes."""
         regime_lists = (run.results.regimes for run in self.runs if run.scene not in self.unlike)
         names = sorted({regime for regimes in regime_lists for regime in regimes})
-        if len(names) < 2:  # noqa: PLR2004 - a single one would repeat `overall`
+        if len(names) < 2:  # noqa: PLR2004 - a single regime would repeat `overall`
             return ()
         return pairwise.judged(
             self._at_end(couple, self.quantity, regime or OVERALL, regime, self.unlike)

@@ -18,7 +18,7 @@ from crossgrad_plugins.compare.statistics import (
 
 #: Function that maps a run to its value, or to None if the run has no value.
 Reading: TypeAlias = Callable[[Run], float | None]
-#: Scene and seed -> the run of an arm.
+#: Scene and seed -> run of one arm.
 Runs: TypeAlias = Mapping[Problem, Run]
 
 

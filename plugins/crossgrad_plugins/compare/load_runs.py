@@ -22,7 +22,7 @@ from crossgrad_plugins.compare.run import Run
 if TYPE_CHECKING:
     from crossgrad_core.commands import RunResults
 
-#: The table of a sweep, next to the folder of its runs.
+#: Name of the table of a sweep, which is next to the folder of the runs.
 _PLAN: Final = "runs.csv"
 _ID, _LABEL = "run", "configuration"
 _LENGTHS: Final = ("steps=", "max_views=", "seconds=")

@@ -13,9 +13,9 @@ from crossgrad_core.commands import (
     write_atomically,
 )
 
-#: Name of the page. A folder belongs to a comparison if it contains a page with the mark.
+#: Name of the page. A folder was written by a comparison if it contains a page with `MARK`.
 PAGE: Final = "index.html"
-#: The mark: a part of the head of each page that compare wrote.
+#: This tag is in the head of each page that `compare` wrote.
 MARK: Final = '<meta name="generator" content="crossgrad compare">'
 FIGURES: Final = "figures"
 _BEGINNING: Final = 2000

@@ -15,7 +15,8 @@ from crossgrad_plugins.compare.run import Run
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-#: Limits that keep the page small: views of all scenes, views of one scene, arms per view, bytes.
+#: Limits that keep the page small: number of views of all scenes, of views of one scene, of arms
+#: per view, and of bytes.
 MOST_VIEWS, MOST_OF_A_SCENE, MOST_ARMS = 8, 3, 6
 MOST_BYTES: Final = 1_400_000
 _WIDTHS: Final = (320, 260, 200, 150)

@@ -20,7 +20,8 @@ Array: TypeAlias = NDArray[np.float64]
 Settings: TypeAlias = dict[str, str]
 #: The value of a setting that is not set.
 ABSENT: Final = "-"
-#: Settings that do not separate arms: location, length, and components that only observe.
+#: Settings that do not separate arms: the location and the length of a run, and components that
+#: only observe.
 _NO_ARM: Final = frozenset(
     {
         *("crossgrad", "scene", "seed", "out"),

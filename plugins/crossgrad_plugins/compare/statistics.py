@@ -14,14 +14,15 @@ _TWO: Final = 2
 _SEED: Final = 20_150_101
 #: The interval is computed by bootstrap if there are at least this many pairs.
 BOOTSTRAP_FROM: Final = 10
-#: Level of the interval for a difference, and level of the interval for equivalence.
+#: Confidence level of the interval for a difference, and confidence level of the interval for
+#: equivalence.
 WIDE, NARROW = 0.95, 0.90
 MEAN, IQM = "mean, Student's t", "IQM, bootstrap"
 _UNKNOWN = (-inf, inf)
 Interval: TypeAlias = tuple[float, float]
-#: Upper limit of the number of pairs that is suggested for one comparison.
+#: Maximum number of pairs that the report suggests for one comparison.
 MOST_PAIRS: Final = 1000
-#: Verdicts of up to this number of comparisons are not corrected for multiple tests.
+#: With at most this number of comparisons, verdicts are not corrected for multiple tests.
 UNCORRECTED: Final = 5
 
 

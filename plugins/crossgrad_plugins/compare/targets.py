@@ -12,10 +12,10 @@ from crossgrad_plugins.compare.contrasts import Runs
 from crossgrad_plugins.compare.quantity import Cost, Quantity
 from crossgrad_plugins.compare.run import Run
 
-#: The profile is drawn up to this ratio.
+#: The performance profile is drawn up to this ratio.
 LARGEST_RATIO = 4.0
-#: A run may end earlier by this relative amount, and its last value is still used. The length of
-#: a run with a time limit is a whole number of steps.
+#: A run may end earlier than an amount by this share, and its last value still counts for the
+#: amount. The reason is that the length of a run with a time limit is a whole number of steps.
 _SAME_END = 0.03
 
 

@@ -29,9 +29,10 @@ from crossgrad_core.plugin import (
 
 #: A split divides the scales by this factor (3DGS).
 SPLIT_SHRINK = 1.6
-#: Length of a child along the axis, as a share of the parent. Two children are placed `_APART` to
-#: either side, so that together they have the variance of the parent. Their opacity is multiplied
-#: by `_FAINTER`, so that together they cover as much as the parent.
+#: Length of a child along the axis, as a share of the parent. The children are placed at the
+#: distance `_APART` on both sides of the parent's centre, so that both children together have the
+#: variance of the parent. Their opacity is multiplied by `_FAINTER`, so that both together cover as
+#: much as the parent.
 _KEPT: Final = 0.6
 _APART: Final = sqrt(1.0 - _KEPT**2)
 _FAINTER: Final = 1.0 / (2.0 * _KEPT)
@@ -290,7 +291,7 @@ class AxisSplit(CloneSplit):
         if self.division != "axis":
             return super().grown_values(context, state, plan)
         rows = plan.child.nonzero().squeeze(1)
-        # The first children of all parents come before the second ones.
+        # The first children of all parents come before the second children.
         parents = plan.source[rows[: len(rows) // 2]]
         left, right = (
             child_on_axis(context, parents, offset, log(_KEPT), log(_FAINTER))

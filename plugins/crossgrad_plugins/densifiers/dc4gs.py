@@ -27,7 +27,8 @@ def inconsistency(sums: Tensor) -> Tensor:
     Source: DC4GS.
     """
     x, y, absolute_x, absolute_y, number = sums
-    # Without pixels this is (1 - 0 / 1) times a ga of 0. Rounding can make the mean longer than 1.
+    # For a Gaussian without pixels, the factor is 1 - 0 / 1 and the gradient sum is 0. Rounding can
+    # make the mean longer than 1.
     rest = (1.0 - torch.sqrt(x * x + y * y) / number.clamp(min=1.0)).clamp(min=0.0)
     scores: Tensor = rest * torch.sqrt(absolute_x * absolute_x + absolute_y * absolute_y)
     return scores
@@ -42,7 +43,7 @@ def plane_scores(bins: Tensor) -> Tensor:
     left, right = [bins[0]], [bins[-1]]
     for plane in range(1, PLANES):
         left.append(left[-1] + bins[plane])
-        # Sum from the other end, because the total minus the left side would leave rounding errors
+        # Sum the bins from the other end. The total minus the left side would leave rounding errors
         # in empty bins.
         right.append(right[-1] + bins[-1 - plane])
     sides = zip(left, reversed(right), strict=True)
@@ -124,8 +125,8 @@ class DirectionalConsistency(CloneSplit):
         parting = screen_statistics.mean(state.per_primitive, "inconsistency", "renders")
         clone = (gradient >= self.grad_threshold) & small
         split = (parting >= self.split_threshold) & ~small
-        # In units of their thresholds, clones and splits can be ranked together if the budget is
-        # short.
+        # Divide both criteria by their thresholds, so that clones and splits can be ranked together
+        # if the budget is short.
         urge = torch.where(small, gradient / self.grad_threshold, parting / self.split_threshold)
         return Growth(clone=clone, split=split, strength=urge)
 
@@ -134,7 +135,7 @@ class DirectionalConsistency(CloneSplit):
         self, context: DensifyContext, state: PluginState, plan: Plan
     ) -> dict[str, Rows]:
         rows = plan.child.nonzero().squeeze(1)
-        # The first children of all parents come before the second ones.
+        # The first children of all parents come before the second children.
         parents = plan.source[rows[: len(rows) // 2]]
         position = split_positions(state.per_primitive["planes"][parents])
         children = [

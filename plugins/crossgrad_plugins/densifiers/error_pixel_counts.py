@@ -25,7 +25,8 @@ from crossgrad_core.plugin import (
 MARKED, ERROR, VISITS = "marked", "error", "visits"
 #: Number of rendered views of each regime.
 DRAWN = "drawn"
-#: Power of the number of renders in the rank of a primitive: between a sum (0) and a mean (1).
+#: Power of the number of renders in the rank of a primitive. A power of 0 gives a sum, and a power
+#: of 1 gives a mean.
 VISITS_POWER = 0.75
 
 

@@ -28,7 +28,7 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: Steepness of the gate, and the opacity at which it is half open (3DGS-MCMC).
+#: Steepness of the gate for the noise, and opacity at which the gate is half open (3DGS-MCMC).
 GATE_STEEPNESS = 100.0
 GATE_OPACITY = 0.005
 #: Shifts below this share of a Gaussian's size are skipped, because float32 cannot represent them.
@@ -171,7 +171,7 @@ class Pool:
         return Pool(self.source[index], opacity[index], scale[index], touched[index])
 
 
-#: Relocation and growth end after 25,000 of 30,000 steps (published).
+#: Relocation and growth end after 25,000 of 30,000 steps, as published.
 LAST_EDIT_SHARE = 25 / 30
 
 

@@ -133,7 +133,7 @@ class MultiViewDensityControl(CountsMarkedPixels, AxisSplit):
     def _capped(self, context: DensifyContext, edit: Edit) -> Edit:
         """Return the edit with opacities limited to the cap; lower opacities keep their moments."""
         if self.cap_opacity == 1.0 or "opacities" in edit.values:
-            return edit  # A reset uses a lower cap.
+            return edit  # An opacity reset uses a lower cap.
         after = edited_parameters(context, edit)
         capped = context.backbone.capped_opacities(after, self.cap_opacity)
         rows = (capped < after["opacities"].detach()).nonzero().squeeze(1)

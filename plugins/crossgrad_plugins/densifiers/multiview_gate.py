@@ -24,10 +24,10 @@ from crossgrad_core.plugin import (
 )
 from crossgrad_plugins.densifiers.error_pixel_counts import CountsMarkedPixels
 
-#: Prefix of the names in the gate's state, which keeps them apart from the names of the other
-#: densifier.
+#: Prefix of the names in the state of the gate. It separates these names from the names of the
+#: wrapped densifier.
 OWN = "gate/"
-#: Hooks of the other densifier that the gate implements for it.
+#: Hooks of the wrapped densifier that the gate implements for it.
 _ANSWERED = frozenset({"crossgrad_densify", "crossgrad_validate_selection"})
 
 

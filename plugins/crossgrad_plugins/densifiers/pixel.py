@@ -48,7 +48,7 @@ class PixelDensityControl(AxisSplit):
         means = record.gaussians.means
         pose = record.view.camera.world_to_camera.to(means, non_blocking=True)
         x, y, z = means.unbind(1)
-        # Do not use a matrix product: its rounding depends on the number of threads.
+        # Do not use a matrix product, because its rounding depends on the number of threads.
         depths = x * pose[2, 0] + y * pose[2, 1] + z * pose[2, 2] + pose[2, 3]
         # The unit of the local frame is the extent of the training cameras.
         return (depths / self.depth_threshold).square().clamp(max=1.0)

@@ -96,11 +96,12 @@ def _shares(context: DensifyContext, gaussians: Gaussians, camera: Camera, error
     return gradient[:, 0]
 
 
-#: Density control ends after 27,000 of 30,000 steps (published).
+#: Density control ends after 27,000 of 30,000 steps, as published.
 LAST_EDIT_SHARE = 27 / 30
 #: Opacities are not lowered below this value.
 LEAST_OPACITY = 1e-6
-#: Below this logit, the shared opacity equals half the opacity up to float32 rounding.
+#: Below this logit, float32 cannot distinguish the shared opacity from half of the original
+#: opacity.
 _FAINT = -15.0
 
 
@@ -172,7 +173,7 @@ class RevisingDensification(CloneSplit):
 
 def halved_logits(logits: Tensor) -> Tensor:
     """Return logits [R] of o' = 1 - sqrt(1 - o); two copies with o' are as opaque as one."""
-    transparency = logsigmoid(-logits) / 2  # This is the log of sqrt(1 - o).
+    transparency = logsigmoid(-logits) / 2  # This is the logarithm of sqrt(1 - o).
     shared = torch.log(-torch.expm1(transparency)) - transparency
     return torch.where(logits < _FAINT, logits - log(2.0), shared)
 

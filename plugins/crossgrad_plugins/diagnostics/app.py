@@ -144,7 +144,7 @@ def _write(report: Report, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     report.write(folder)
     for line in report.lines():
-        print(one_line(line))  # noqa: T201 - the result of the command
+        print(one_line(line))  # noqa: T201 - print the result of the command
     print(f"\ntables and {PICTURE} in {one_line(folder)}")  # noqa: T201
 
 

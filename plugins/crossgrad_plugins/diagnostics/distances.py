@@ -8,10 +8,10 @@ from scipy.stats import rankdata
 
 #: Correlations that differ by less than this count as equal.
 _ROUNDING = 1e-9
-#: Number of decimals of a difference of logarithms that are kept; further decimals are rounding
+#: Number of decimals of a difference of logarithms that are kept. Further decimals are rounding
 #: errors.
 _DIGITS = 9
-#: Number of bins of pairs, by the difference of their distances.
+#: Number of bins of photo pairs. The pairs are binned by the difference of their distances.
 _BINS = 4
 
 
@@ -62,14 +62,14 @@ def conflict_by_distance(
     apart = _apart(logs, first, second)
     negative = products[first, second] < 0.0
     edges = np.quantile(apart, np.linspace(0.0, 1.0, _BINS + 1))
-    # The first order is the order of the data.
+    # The first order is the original order of the data. The other orders are random permutations.
     orders = [
         np.arange(len(positive)),
         *(rng.permutation(len(positive)) for _ in range(permutations)),
     ]
     order = np.stack(orders)
     correlations = _correlations(ranks[order[:, first], order[:, second]], negative)
-    # Equal correlations may differ by rounding, because their sums use another order.
+    # Equal correlations may differ by rounding, because their sums have different orders.
     above = int((correlations[1:] >= correlations[0] - _ROUNDING).sum())
     p_value = (1 + above) / (1 + permutations) if np.isfinite(correlations[0]) else np.nan
     rates = _rates(apart, negative, edges)

@@ -61,8 +61,8 @@ def _rows(scene: Scene, gains: TrackGains) -> list[Row]:
     of_exif = exposure_values(scene)
     photo_gains = zip(scene.views, gains.gains, gains.known, strict=True)
     of_tracks = {view.name: float(gain) for view, gain, is_known in photo_gains if is_known}
-    # EXIF data give only differences, so their values are shifted to the tracks if photos have
-    # both.
+    # EXIF data give only differences of exposure. If some photos have both EXIF and track values,
+    # the EXIF values are shifted to match the track values.
     both = [of_tracks[name] - value for name, value in of_exif.items() if name in of_tracks]
     shift = median(both) if both else -sum(of_exif.values()) / max(1, len(of_exif))
     trained = frozenset(scene.train)

@@ -103,8 +103,8 @@ class GroupedGramian:
         centring = np.eye(n + m) - averaging
         deviations = centring @ ordered @ centring
         difference = np.concatenate([np.full(n, 1.0 / n), np.full(m, -1.0 / m)])
-        # Leave the view out of the mean: otherwise its length would correlate with its position
-        # along the gap.
+        # Leave the view out of the mean. If it were included, the length of its gradient would
+        # correlate with its position along the gap.
         self_terms = np.diag(deviations) / np.concatenate(
             [np.full(n, n - 1.0), np.full(m, 1.0 - m)]
         )

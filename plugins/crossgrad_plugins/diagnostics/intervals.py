@@ -10,17 +10,19 @@ from numpy.typing import NDArray
 from crossgrad_plugins.diagnostics.grouped import GroupedGramian, Groups, split_of
 from crossgrad_plugins.diagnostics.resampling import Resamples
 
-#: Maximum share of the error of the ratio's interval that is moved from its lower to its upper end,
-#: and the share of sigma_w^2 in the variance above which this maximum applies. A sample with too
-#: few long gradients makes sigma_w^2 too small and the ratio too large.
+#: First value: maximum share of the error of the ratio's interval that moves from the lower to the
+#: upper end. Second value: if sigma_w^2 contributes at least this share of the variance, the
+#: maximum applies. A sample with too few long gradients makes sigma_w^2 too small and the ratio too
+#: large.
 _MOVED = 0.4
 _WITHIN_RULES = 1.0 / 3.0
 #: The unbiased estimate of tr(Sigma^2) needs four views of each group.
 SMALLEST_FOR_INTERVALS = 4
 #: A variance below this size, relative to the squared lengths, counts as a rounding error.
 _NEGLIGIBLE = 1e-13
-#: Share of the error of sigma_w^2's interval that is put on its upper end. A few views miss rare
-#: long gradients more often than they contain too many, so the error is not split evenly.
+#: Share of the error of sigma_w^2's interval that is put on its upper end. The error is not split
+#: evenly, because a small sample of views more often contains too few of the rare long gradients
+#: than too many.
 _UPPER_SHARE = 0.2
 _DOUBLINGS = 60
 _BISECTIONS = 24
@@ -89,7 +91,7 @@ class StudentisedGap:
     def of(cls, parts: GroupedGramian, groups: Groups, draws: Resamples) -> "StudentisedGap":
         """Combine the split Gramian with its resamples."""
         noise = draws.noise[1:]
-        # The noise of a resample scales with the square of its spread.
+        # The noise of a resample is proportional to the square of its spread.
         relative = (draws.spread[1:] / draws.spread[0]) ** 2
         floors = relative * (float(noise.var()) / float(relative.mean()))
         floor = _variance_without_gap(parts, groups)
@@ -281,8 +283,8 @@ def inverted(pivot: Callable[[float], Pivot], start: float, level: float) -> Int
         start: Positive value of about the size of the upper end.
         level: Confidence level of the interval.
     """
-    # If 0 is rejected from above, all larger values are rejected too; [0, 0] would wrongly claim
-    # exactly 0.
+    # If the value 0 is rejected as too large, all larger values are rejected too. The interval [0,
+    # 0] would then wrongly claim exactly 0.
     if not pivot(0.0).above(level, lower_end=False):
         return UNKNOWN
     return Interval(

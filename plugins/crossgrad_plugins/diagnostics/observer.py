@@ -10,7 +10,7 @@ from crossgrad_core.plugin import Model, Observer, RunInfo, hookimpl
 if TYPE_CHECKING:
     from crossgrad_plugins.diagnostics.watch import Watch
 
-#: Number of probes of a run if the user sets no interval.
+#: Number of gradient measurements in a run if the user sets no interval.
 _PROBES = 8
 
 
@@ -35,7 +35,7 @@ class Diagnostics(Observer):
     )
     seed: int = Field(0, ge=0, description="seed for the choice of views and for the bootstrap")
 
-    # The results so far, which are not part of the run's state.
+    # The results so far. They are not part of the run's state.
     _run: RunInfo | None = PrivateAttr(default=None)
     _watch: "Watch | None" = PrivateAttr(default=None)
 

@@ -10,7 +10,7 @@ from crossgrad_core.commands import build
 from crossgrad_core.plugin import Grouping, Json, Scene, UserError, footprint_of, radial_distances
 from crossgrad_plugins.diagnostics.grouped import SMALLEST_GROUP
 
-#: The default grouping of a probe, as in the paper.
+#: The default grouping of a gradient measurement, as in the paper.
 DEFAULT_GROUPING = "radial"
 #: The name of the grouping that a run was trained with.
 OF_THE_RUN = "of the run"

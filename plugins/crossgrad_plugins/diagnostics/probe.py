@@ -12,7 +12,7 @@ from torch import Tensor
 from crossgrad_core.commands import gathered, view_gradients
 from crossgrad_core.plugin import BlockKind, Model
 
-#: Maximum memory of the gradients of all probed views, in bytes.
+#: Maximum number of bytes for the gradients of all views that are measured.
 MEMORY = 512 * 2**20
 
 _Gradients = dict[str, Tensor]

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from crossgrad_plugins.diagnostics.grouped import GroupedGramian, Groups
 
-#: Minimum number of different cameras of a group in a resample. A resample with fewer cameras would
-#: have no variance, so it is drawn again.
+#: Minimum number of different cameras of a group in a resample. A resample with fewer cameras has
+#: no variance, so a new resample is drawn.
 _FEWEST_CAMERAS = 3
 
 _Array = NDArray[np.float64]
@@ -57,7 +57,7 @@ class GroupResamples:
         halves = (squared[:, None] + squared[None, :] - 2.0 * deviations) / 2.0
         to_others = counts @ halves
         self_share = (counts * counts).sum(axis=1) / n**2
-        # Conditional means of the pair kernel, one per camera; pairs of copies of a camera are left
+        # Means of the pair kernel for each camera. Pairs of two copies of the same camera are left
         # out.
         conditional = 2.0 * to_others / (n - counts)
         mean_along = counts @ along / n
@@ -122,7 +122,8 @@ class Resamples:
         far = GroupResamples.of(parts.far, parts.far_along, multiplicities(m, resamples, rng))
         (f, g), (p, q) = groups.unseen, groups.shares
         p, q = p * groups.divisors[0], q * groups.divisors[1]
-        # In a finite population, only the unprobed share of the noise's variance remains.
+        # The views of a group are finite in number, so the variance of the noise is multiplied by
+        # the share of views without a measurement.
         root_f, root_g = f**0.5, g**0.5
         near_spread = near.spread[0] + root_f * (near.spread - near.spread[0])
         far_spread = far.spread[0] + root_g * (far.spread - far.spread[0])

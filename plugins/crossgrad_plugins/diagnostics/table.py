@@ -82,7 +82,7 @@ def _mean(values: NDArray[np.float64]) -> float:
     return float(valid.mean()) if len(valid) else float("nan")
 
 
-#: Minimum number of views to fit a line and the scatter around it.
+#: Minimum number of views for a fit of a line and for the scatter around the line.
 _SMALLEST = 4
 
 

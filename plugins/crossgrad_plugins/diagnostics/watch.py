@@ -30,7 +30,8 @@ from crossgrad_plugins.diagnostics.report import Report
 from crossgrad_plugins.diagnostics.table import Row, per_pair_conflict, table
 from crossgrad_plugins.groupings.heights import altitudes, upward
 
-#: Groupings for which the same probe is also evaluated (the paper's prediction P4).
+#: Groupings that are also evaluated with the gradients of the same measurement (prediction P4 of
+#: the paper).
 GROUPINGS = ("radial", "altitude", "footprint", "kmeans", "gmm")
 
 
@@ -51,8 +52,8 @@ def distances_of(scene: Scene) -> dict[str, NDArray[np.float64]]:
 def camera_rows(scene: Scene) -> list[Row]:
     """Return the bimodality of heights and log-distances, and the variance of the distances."""
     axis, source = upward(scene)
-    # Name -> values of a distance and Var(r) / mean(r)^2. Heights have no such ratio, because their
-    # origin is arbitrary.
+    # Name -> values of a distance, and Var(r) / mean(r)^2. Heights have no such ratio, because
+    # their origin is arbitrary.
     heights = altitudes(scene, scene.train_views, axis)
     samples = {f"height ({source})": (heights, float("nan"))}
     for name, values in distances_of(scene).items():
@@ -173,7 +174,8 @@ class Watch:
 
     def due(self, step: int) -> bool:
         """Return True if a probe is due after this step."""
-        # The probe at the end replaces a probe that was made shortly before.
+        # Skip a measurement shortly before the end of the run, because another measurement is made
+        # at the end.
         return step == self.total or (step % self.every == 0 and step <= self.total - self.every)
 
     @hookimpl

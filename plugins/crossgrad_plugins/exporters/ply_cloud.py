@@ -17,11 +17,11 @@ from crossgrad_core.plugin import Gaussians, Similarity
 REST = 15
 
 _SMALLEST_SCALE = float(np.finfo(np.float32).tiny)
-#: Keeps the logit of an opacity of exactly 0 or 1 finite; 1 minus this is the largest float32 below
-#: 1.
+#: With this margin, the logit of an opacity of exactly 0 or 1 is finite. 1 minus the margin is the
+#: largest float32 number below 1.
 _OPACITY_MARGIN = 2.0**-24
 
-#: How viewers should draw the Gaussians: the 3DGS way, or antialiased as Mip-Splatting.
+#: How viewers should draw the Gaussians: as 3DGS does, or antialiased as Mip-Splatting does.
 RenderMode = Literal["default", "mip"]
 
 

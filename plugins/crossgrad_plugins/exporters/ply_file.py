@@ -24,7 +24,7 @@ from crossgrad_core.plugin import (
 )
 from crossgrad_plugins.exporters.ply_cloud import REST, RenderMode, SplatCloud
 
-#: Property names in the order of the file.
+#: Names of the properties in the order of the file.
 PROPERTIES = (
     *("x", "y", "z", "nx", "ny", "nz"),
     *(f"f_dc_{i}" for i in range(3)),
@@ -41,9 +41,9 @@ _OFFSET_TAG = "crossgrad_offset:"
 _MODE_TAG = "SplatRenderMode:"
 _CHUNK = 65_536
 _LARGEST = float(np.finfo(np.float32).max)
-#: Natural logarithm of the largest size; the limit of float32 is about e^88.
+#: Natural logarithm of the largest size. Float32 numbers end at about e^88.
 _LARGEST_LOG_SCALE = 80.0
-#: Range of the length of a rotation, so that float32 can represent its square.
+#: Allowed length of a rotation quaternion, so that float32 can represent its square.
 _ROTATION_LENGTHS = (1e-18, 1e18)
 _OFFSET = re.compile(r"\s+".join([r"([-+]?[0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)"] * 3))
 _IDENTITY = Similarity(np.zeros(3), 1.0)
@@ -119,7 +119,8 @@ def position_offset(similarity: Similarity) -> NDArray[np.float64]:
     if error <= POSITION_TOLERANCE:
         return np.zeros(3)
     exponent = floor(log10(1.0 / similarity.scale))
-    offset: NDArray[np.float64] = np.round(similarity.offset, -exponent) + 0.0  # no negative zeros
+    # Adding 0 avoids negative zeros
+    offset: NDArray[np.float64] = np.round(similarity.offset, -exponent) + 0.0
     return offset
 
 
@@ -273,8 +274,8 @@ def _require_properties(names: Collection[str], path: Path) -> None:
 
 
 def _check_finite(column: NDArray[np.generic], name: str, path: Path, top: float) -> None:
-    # Values beyond the range of float32 count as infinite; NaN fails the comparison too.
-    with np.errstate(invalid="ignore"):  # a signalling NaN
+    # Values beyond the range of float32 count as infinite. NaN also fails the comparison.
+    with np.errstate(invalid="ignore"):  # A signalling NaN causes this warning
         numbers = column.astype(np.float64)
     valid = (numbers >= -_LARGEST) & (numbers <= top)
     if not valid.all():

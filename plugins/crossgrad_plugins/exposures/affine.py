@@ -11,8 +11,8 @@ from crossgrad_plugins.exposures.light import mapped
 from crossgrad_plugins.exposures.per_photo import ExposurePerPhoto
 from crossgrad_plugins.exposures.srgb import EXPONENT, OFFSET, STRETCH
 
-#: Larger inverses belong to maps that (nearly) lose a colour and cannot be undone. Only values from
-#: files and very high learning rates lead to such maps.
+#: An inverse with larger elements belongs to a map that (nearly) removes a colour and cannot be
+#: undone. Only values from files and very high learning rates lead to such maps.
 _LARGEST_INVERSE = 1e3
 #: A map that turns white into black counts as this scale: 48 stops.
 _DARKEST = 2.0**-20
@@ -35,7 +35,7 @@ class Affine(ExposurePerPhoto):
 
     @override
     def of_stops(self, stops: Tensor) -> Tensor:
-        # A gain in linear light equals this map for all but dark values: s (x + o) - o.
+        # For all values except dark ones, a gain in linear light equals this map: s (x + o) - o.
         scale = torch.exp2(stops / EXPONENT)[..., None, None]
         ones = torch.ones(3, 1, dtype=stops.dtype, device=stops.device)
         diagonal = torch.eye(3, dtype=stops.dtype, device=stops.device)
@@ -48,8 +48,9 @@ class Affine(ExposurePerPhoto):
 
     @override
     def shift(self, name: str, values: Tensor, start: Tensor, end: Tensor) -> Tensor:
-        # Adding the difference would change the relative exposure of photos, and could make dark
-        # values negative. So a photo's map is applied after `end` and then the inverse of `start`.
+        # Do not add the difference of the maps: this would change the relative exposure of the
+        # photos and could make dark values negative. The new map applies `end` first, then the
+        # inverse of `start`, and then the map of the photo.
         inverse, failed = torch.linalg.inv_ex(start[:, :3])
         if failed or not inverse.abs().max() < _LARGEST_INVERSE:
             return super().shift(name, values, start, end)

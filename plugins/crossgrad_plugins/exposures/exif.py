@@ -66,7 +66,8 @@ def _positive(value: object) -> float | None:
 
 #: Number of headers that are read in parallel.
 _AT_ONCE = 4
-# Cached, because a run requests the values at every evaluation and a scene does not change.
+# The results are cached, because a run requests the values at every evaluation and a scene does not
+# change.
 _KNOWN: "WeakKeyDictionary[Scene, Mapping[str, float]]" = WeakKeyDictionary()
 
 

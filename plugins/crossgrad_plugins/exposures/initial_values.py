@@ -18,20 +18,22 @@ if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 
-#: The source of the initial values.
+#: Source of the initial exposure values.
 Start: TypeAlias = Literal["auto", "tracks", "exif", "none"]
-#: Photos farther than this from the mean, in stops, share few usable values with other photos.
+#: Photos whose exposure differs from the mean by more than this many stops share few usable values
+#: with other photos.
 _FAR = 4.0
 _NAMED = 3
-#: Maximum number of neighbours that predict a photo.
+#: Maximum number of neighbouring photos that predict the exposure of a photo.
 TELLING = 4
-#: Up to this number of photos, neighbours and regimes predict every photo equally well.
+#: With at most this number of photos, neighbours and regimes predict every photo equally well.
 _SAME = 2
-#: Smaller distances are set to this distance, so that a photo taken twice does not outweigh all
-#: others.
+#: Smaller distances are replaced by this distance, so that a photo taken twice does not outweigh
+#: all other photos.
 _NEAREST = 1e-3
 _Floats: TypeAlias = NDArray[np.float64]
-# Cached, because a run requests each held-out photo at every evaluation, and scenes do not change.
+# The results are cached, because a run requests each held-out photo at every evaluation, and scenes
+# do not change.
 _KNOWN: "WeakKeyDictionary[Scene, Neighbours]" = WeakKeyDictionary()
 
 

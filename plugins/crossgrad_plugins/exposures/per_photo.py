@@ -91,7 +91,8 @@ class ExposurePerPhoto(Exposure):
         trained = values[self.parameter]
         rows = [row for row, photo in enumerate(scene.train_views) if photo.name in exif]
         if view.name in exif and rows:
-            # Sensors differ, and a regime often has its own sensor.
+            # Use photos of the same regime, because sensors differ and a regime often has its own
+            # sensor.
             rows = [row for row in rows if scene.train_views[row].regime == view.regime] or rows
             stops = [exif[view.name] - exif[scene.train_views[row].name] for row in rows]
             shift = self.beside(trained[rows], torch.tensor(stops).to(trained))

@@ -69,7 +69,7 @@ def place_at(point: NDArray[np.float64]) -> Place | None:
         bend = _AXIS / math.sqrt(1 - _ECCENTRICITY * math.sin(latitude) ** 2)
         latitude = math.atan2(z + _ECCENTRICITY * bend * math.sin(latitude), around)
     sine, cosine = math.sin(latitude), math.cos(latitude)
-    # The altitude along the vertical; this formula also holds at the poles and at the equator.
+    # The altitude along the vertical. This formula also holds at the poles and at the equator.
     flat = _AXIS * math.sqrt(1 - _ECCENTRICITY * sine**2)
     altitude = around * cosine + z * sine - flat
     return Place(math.degrees(latitude), math.degrees(math.atan2(y, x)), altitude)

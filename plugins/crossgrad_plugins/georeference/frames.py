@@ -10,24 +10,25 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-#: Maximum deviation of a rotation whose digits were rounded; the rotation is made orthonormal
+#: Maximum deviation of a rotation matrix whose digits were rounded. The matrix is made orthonormal
 #: again.
 _ROUNDED: Final = 1e-3
 _EXACT: Final = 1e-12
 _LAST_ROW: Final = np.array([0.0, 0.0, 0.0, 1.0])
 #: Minimum number of points for a fit with a residual, and minimum number for rejecting outliers.
 FEWEST, _FEWEST_TO_REJECT = 3, 8
-#: Number of triples that are tried, maximum number of points per trial, and maximum number of
-#: rejection passes.
+#: Number of triples of points that are tried, maximum number of points per trial, and maximum
+#: number of rejection passes.
 _TRIPLES, _MOST_TRIED, _PASSES = 500, 100, 50
-#: Residuals beyond this many medians are outliers. One of 10^5 normal errors exceeds it if two axes
-#: have equal errors, and fewer exceed it if three axes have equal errors.
+#: A residual is an outlier if it exceeds this many medians. If two axes have equal errors, one of
+#: 10^5 normal errors exceeds this limit. If three axes have equal errors, fewer exceed it.
 _FAR: Final = 4.0
 #: Residuals below this share of the extent are rounding errors.
 _ROUNDING: Final = 1e-9
-#: Maximum standard error of the turn about the longest extent, radians.
+#: Maximum standard error in radians of the rotation about the longest extent of the points.
 _LARGEST_TILT: Final = np.radians(10.0)
-#: Points closer to a line than this share of their extent count as collinear, even if exact.
+#: Points count as collinear if their distance from a line is below this share of their extent, even
+#: if the points are exact.
 _THINNEST: Final = 1e-5
 
 
@@ -131,7 +132,8 @@ def fit_similarity(points: NDArray[np.float64], measured: NDArray[np.float64]) -
         kept = _agreeing(points, measured)
     frame = _frame(points[kept], measured[kept])
     errors = measured - frame.points(points)
-    # The similarity has seven parameters, so three points leave two of nine degrees of freedom.
+    # The similarity has seven parameters. Three points therefore leave two of their nine degrees of
+    # freedom.
     sigma = float(np.sqrt((errors[kept] ** 2).sum() / (3 * int(kept.sum()) - 7)))
     posed = frame.scale * (points[kept] - points[kept].mean(axis=0))
     along, *across = np.linalg.svd(posed, compute_uv=False)
@@ -156,7 +158,7 @@ def _agreeing(points: NDArray[np.float64], measured: NDArray[np.float64]) -> NDA
     best = int(np.argmin(medians))
     frame = Frame3D(rotations[best], shifts[best], float(scales[best]))
     least = _ROUNDING * float(np.abs(measured - measured.mean(axis=0)).max())
-    # The residuals are computed again with other rounding, but at least half of the points must
+    # The new residuals have other rounding errors than before, but at least half of the points must
     # remain.
     half = max(float(medians[best]) * (1.0 + _ROUNDING), least)
     kept = np.linalg.norm(measured - frame.points(points), axis=1) <= half

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-#: Latitude and longitude in degrees, and altitude in metres; each may be NaN.
+#: Latitude and longitude in degrees, and altitude in metres. Each of the three numbers may be NaN.
 Numbers: TypeAlias = tuple[float, float, float]
 _IFD: Final = 0x8825
 _SOUTH_OR_WEST: Final = {"S", "W"}
-#: EXIF values of altitudes below sea level, and below the ellipsoid.
+#: EXIF values of altitude references for altitudes below sea level and below the ellipsoid.
 _BELOW: Final = {1, 3}
 _STEPS: Final = (1.0, 60.0, 3600.0)
 

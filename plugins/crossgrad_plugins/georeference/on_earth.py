@@ -18,8 +18,8 @@ from crossgrad_plugins.georeference.frames import SAME, Frame3D
 from crossgrad_plugins.georeference.projection import Projection, utm_code
 from crossgrad_plugins.rasterizers.reference.harmonics import harmonics
 
-#: Number of directions in which the harmonics of a rotated frame are compared; more than twice the
-#: number of harmonics.
+#: Number of directions in which the spherical harmonics of a rotated frame are compared. It is more
+#: than twice the number of harmonics.
 _DIRECTIONS = 48
 
 
@@ -67,7 +67,8 @@ def _directions() -> Tensor:
     return unit
 
 
-#: Distances of photos from their GPS positions, in metres: 3-D, along the ground, vertical.
+#: Statistics of the distances between photos and their GPS positions in metres: in 3-D, along the
+#: ground, and vertically.
 RESIDUALS: Final = ("median", "rms", "max", "rms_horizontal", "rms_vertical")
 _CONVENTION: Final = (
     "position = numbers of the file + offset; [east, north, up, 1] = transform [position, 1], "

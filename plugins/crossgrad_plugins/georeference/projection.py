@@ -18,11 +18,11 @@ _CODE: Final = re.compile(r"epsg:[0-9]{1,6}", re.IGNORECASE | re.ASCII)
 _SHOWN: Final = 80
 #: Geocentric coordinates of WGS 84.
 GEOCENTRIC: Final = "epsg:4978"
-#: Distance in metres on both sides of a place between which a projection is linearized.
+#: Distance in metres on both sides of a point. The projection is linearized between these two ends.
 _NEAR: Final = 10.0
-#: Accuracy in metres for which no message is needed.
+#: No message is needed if the accuracy in metres is better than this.
 _KNOWN_WELL: Final = 1.0
-#: Maximum relative difference of scale between directions; a UTM zone has 0.001.
+#: Maximum relative difference of scale between directions. In a UTM zone, the difference is 0.001.
 _UNEVEN: Final = 0.005
 
 
@@ -51,7 +51,7 @@ class Projection:
         Raises:
             UserError: The code is invalid or unknown, or a grid or pyproj is missing.
         """
-        # Other forms of PROJ could name files anywhere.
+        # Accept only codes, because other strings that PROJ accepts could name any file.
         if not _CODE.fullmatch(code):
             raise _unknown(where, repr(code)[:_SHOWN])
         try:

@@ -124,8 +124,8 @@ def spectral_cut(cosines: NDArray[np.float64]) -> NDArray[np.int64]:
     similarity = (1.0 + cosines) / 2.0
     root = np.sqrt(similarity.sum(axis=1))
     # The second smallest eigenvalue of I - S is the second largest of S. The largest eigenvalue of
-    # S is 1, with a known eigenvector. Two groups without any similarity have the eigenvalue 1
-    # twice, so the known eigenvector is removed to find the other one.
+    # S is 1, with a known eigenvector. If two groups have no similarity, the eigenvalue 1 occurs
+    # twice. The known eigenvector is therefore removed to find the other eigenvector.
     scaled = similarity / root[:, None] / root[None, :]
     first = root / np.linalg.norm(root)
     values, vectors = np.linalg.eigh((scaled + scaled.T) / 2.0 - 2.0 * np.outer(first, first))

@@ -123,8 +123,8 @@ def _maximised(
     likelihood: float,
 ) -> _Mixture:
     """Return the mixture with the weighted moments of the cameras; shares [N, 2] are weights."""
-    # A component without any camera keeps finite values; `_usable` rejects it because of its
-    # weight.
+    # A component without any camera keeps finite values. `_usable` rejects the component because of
+    # its weight.
     totals = np.maximum(shares.sum(axis=0), np.finfo(np.float64).tiny)
     means = (shares * logs[:, None]).sum(axis=0) / totals
     squares = (shares * (logs[:, None] - means) ** 2).sum(axis=0) / totals

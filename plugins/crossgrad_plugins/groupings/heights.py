@@ -21,8 +21,8 @@ def altitudes(scene: Scene, views: Sequence[View], up: NDArray[np.float64]) -> N
 
     Rounding differences between equal heights are removed, as in `radial_distances`.
     """
-    # Do not use a matrix product: its rounding depends on the number of rows, and a median
-    # threshold equals one of the heights exactly.
+    # Do not use a matrix product, because its rounding depends on the number of rows. A median
+    # threshold is exactly equal to one of the heights, so the rounding matters.
     return without_rounding(scene, ((centers_of(views) - scene.middle) * up).sum(axis=1))
 
 

@@ -10,8 +10,8 @@ from crossgrad_core.plugin import Camera, View
 
 #: A Gaussian is assumed to hide the area within this number of standard deviations.
 _WITHIN = 2.0
-#: Largest radius of a disc, as a share of the photo's longer side. A larger Gaussian is a wrong
-#: point, or soon becomes smaller.
+#: Largest radius of a disc, as a share of the photo's longer side. A larger Gaussian comes from a
+#: wrong point, or training soon makes it smaller.
 _LARGEST = 1.0 / 8.0
 #: A cell is covered if small Gaussians fill this share of its area.
 _COVERED = 0.5
@@ -123,8 +123,8 @@ class Cells:
         ends = np.array([columns, rows])
         first = np.clip(np.ceil(middle - half), 0, ends).astype(np.int64)
         behind = np.maximum(np.clip(np.floor(middle + half) + 1, 0, ends).astype(np.int64), first)
-        # Each square adds four corners to a table of differences. One cumulative sum then fills the
-        # squares.
+        # Each square adds four corners to a table of differences. A cumulative sum over the table
+        # then fills all squares.
         steps = np.zeros((rows + 1, columns + 1), dtype=np.int64)
         for across, down, sign in (
             (first[:, 0], first[:, 1], 1),

@@ -14,16 +14,16 @@ if TYPE_CHECKING:
 
 #: Number of neighbours whose distance from the plane is used.
 _NEIGHBOURS = 8
-#: Distances in units of the longer side. All distances below the first value have the same weight.
-#: At the second value, a point has the same weight as the plane.
+#: Distances in units of the photo's longer side. All distances below the first value have the same
+#: weight. At the second value, a point has the same weight as the plane.
 _BLUR, _REACH = 0.02, 0.1
 #: The largest depth of a photo, as a multiple of the depth of its farthest points.
 _FARTHEST = 2.0
 #: Distance of the sky, as a multiple of the distance of the farthest camera or point.
 _SKY = 2.0
-#: Share of the points that may be nearer, or farther, than all added points.
+#: This share of the points may be nearer than all added points. The same share may be farther.
 _TAIL = 0.02
-#: Huber's constant, for 95 % of the efficiency of least squares.
+#: Huber's constant, with which the fit has 95 % of the efficiency of least squares.
 _HUBER, _PASSES = 1.345, 10
 
 

@@ -19,14 +19,14 @@ FEWEST: Final = 8
 #: Standard deviation of an added Gaussian, as a share of the side of its cell.
 _SIZE: Final = 0.8
 _NEAREST: Final = 3
-#: A photo does not show points that are farther away than this multiple of its depth at that
-#: position.
+#: A point is hidden in a photo if it is farther away than this multiple of the photo's depth at
+#: that position.
 _BEHIND: Final = 1.5
 #: A camera is above the ground of a photo if its distance is at least this share of the photo's
-#: depth there, and if the ray down to it is at least this steep (sine).
+#: depth at that position, and if the ray down to it is at least this steep (sine).
 _GROUND, _STEEP = 0.75, 0.3
-#: Number of points from which the extent of the scene is computed, and the share of points that are
-#: not stray.
+#: Number of points from which the extent of the scene is computed, and share of the points that are
+#: not outliers.
 _POINTS, _NOT_STRAY = 1000, 0.98
 
 
@@ -59,7 +59,7 @@ class _Filling:
         self.colors.append(colors)
 
 
-#: Cache of the results per scene; they are deleted together with the scene.
+#: Cache of the results of each scene. The results are deleted together with the scene.
 _KNOWN: "WeakKeyDictionary[Scene, dict[Filled, _Filling]]" = WeakKeyDictionary()
 
 
@@ -136,8 +136,8 @@ class Filled(Initializer):
         filling.inside = len(filling.points) - len(scene.points)
         if margin and with_depth:
             pictures = _Pictures.of(deep)
-            # A camera may be above ground that another photo shows. The other photo then shows, or
-            # hides, the surroundings of this camera.
+            # A camera may be just above ground that another photo shows. The depth of this other
+            # photo then decides whether it shows the surroundings of the camera or hides them.
             centers = np.stack([view.camera.center.numpy() for view, _ in with_depth])
             low = pictures.look_down_on(centers, sky.up)
             high = [pair for pair, inside in zip(with_depth, low, strict=True) if not inside]

@@ -26,13 +26,13 @@ from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
 _ASKEW: Final = 0.5
 _FEWEST: Final = 3
 _GREY: Final = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601
-#: Cache of the results per scene; they are deleted together with the scene.
+#: Cache of the results of each scene. The results are deleted together with the scene.
 _KNOWN: "WeakKeyDictionary[Scene, dict[Triangulated, MorePoints]]" = WeakKeyDictionary()
 #: Lowe's ratio of the distance to the nearest descriptor to the distance to the second nearest
 #: (SIFT, section 7.1).
 _RATIO: Final = 0.8
-#: Smallest and largest angle between two rays. At smaller angles the intersection is inaccurate; at
-#: larger angles the features show different surfaces.
+#: Smallest and largest angle between two rays. At smaller angles the intersection is inaccurate. At
+#: larger angles, the features show different surfaces.
 _SMALLEST, _LARGEST = np.deg2rad(1.5), np.deg2rad(60.0)
 
 
@@ -181,7 +181,7 @@ def _pairs(views: Sequence[View], neighbours: int) -> list[tuple[int, int]]:
     pairs: set[tuple[int, int]] = set()
     for i in range(len(views)):
         distances = np.linalg.norm(centers - centers[i], axis=1)
-        # Cameras at the same position give no depth.
+        # Cameras at the same position cannot determine depth.
         distances[(axes @ axes[i] < _ASKEW) | (distances == 0.0)] = np.inf
         near = np.argsort(distances, kind="stable")[:neighbours]
         pairs |= {(min(i, j), max(i, j)) for j in near.tolist() if np.isfinite(distances[j])}
@@ -242,7 +242,7 @@ def _matched(
     alike[rows, nearest] = -1.0
     rival = alike.max(axis=1)
     alike[rows, nearest] = best
-    # Descriptors have length 1: their squared distance is 2 - 2 cos.
+    # Descriptors have length 1, so their squared distance is 2 - 2 cos.
     clear = (1.0 - best) < _RATIO**2 * (1.0 - rival)
     mutual = alike.argmax(axis=0)[nearest] == rows
     chosen = np.flatnonzero(clear & mutual)

@@ -17,8 +17,8 @@ DEFINITION = (
     "to the photo of the view by least squares over the pixels that count; "
     "clamped and rounded to 8 bits again"
 )
-#: A colour direction in which a render varies less than this, relative to the widest direction, is
-#: treated as constant. A grey render has two such directions, apart from rounding.
+#: If a render varies in a colour direction by less than this share of its widest direction, the
+#: direction counts as constant. Apart from rounding, a grey render has two constant directions.
 _FLAT = 1e-10
 #: Number of pixels that are processed at once, so that intermediate results stay in the cache.
 _AT_ONCE = 2**15

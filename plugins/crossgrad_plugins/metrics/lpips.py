@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from crossgrad_plugins.metrics.lpips_distance import Weights
 
 
-#: The range of the images at the input of the network, for summary.json.
+#: Texts for summary.json about the value range of the images that the network receives.
 IN_FULL_RANGE: Final = "images in [-1, 1], as the method means it"
 IN_UNIT_RANGE: Final = "images in [0, 1], as 3DGS feeds them"
 

@@ -16,9 +16,9 @@ from crossgrad_plugins.metrics.lpips_trunks import Convolution, Trunk
 #: Mean and standard deviation of ImageNet's colours for images in [-1, 1], as in LPIPS.
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
-#: Value that keeps the length of a feature vector above 0.
+#: Lower limit that keeps the length of a feature vector above 0.
 _LEAST = 1e-8
-#: Packages that contain the published heads, and the folders of the heads in them.
+#: Packages that contain the published LPIPS heads, and the folders of the heads in these packages.
 _PACKAGES = (
     ("torchmetrics", ("functional", "image", "lpips_models")),
     ("lpips", ("weights", "v0.1")),
@@ -149,8 +149,8 @@ def _read(path: Path, todo: str) -> Mapping[str, Tensor]:
         # Map to the CPU, so that files written on a GPU can be read without a GPU.
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # Exceptions for damaged files are not documented.
-        # Torch's own message ends with the advice to execute code from the file, so it is not
-        # shown.
+        # Do not show torch's own message, because it ends with the advice to execute code from the
+        # file.
         raise _unreadable(path, f"{type(error).__name__} while reading", todo) from error
     if not isinstance(content, Mapping):
         raise _unreadable(path, f"an object of type {type(content).__name__}", todo)

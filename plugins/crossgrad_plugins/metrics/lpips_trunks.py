@@ -85,7 +85,7 @@ def _vgg(stages: tuple[tuple[int, int], ...]) -> tuple[Convolution, ...]:
                 )
             )
             number, channels_in = number + 2, width
-        number += 1  # Max pooling has its own number in the sequence.
+        number += 1  # In the sequence, a max pooling layer has its own number.
     return tuple(layers)
 
 

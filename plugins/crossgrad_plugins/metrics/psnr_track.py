@@ -61,7 +61,7 @@ def _closest(drawn: Tensor, compared: Compared) -> float | None:
     lit = light > 0.0
     if not lit.any():
         return 0.0
-    # Use the median, because a single light far beyond white would dominate a sum.
+    # Use the median, because a single light source far brighter than white would dominate a sum.
     stops = float(np.log2(np.median(wanted[lit] / light[lit])))
     for step in _STEPS:
         tried = stops + step * np.arange(-_TRIED, _TRIED + 1)

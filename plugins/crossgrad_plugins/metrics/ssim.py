@@ -104,7 +104,7 @@ def _skimage_map(image: Tensor, target: Tensor, mask: Tensor | None) -> NDArray[
 
     def work(start: int) -> None:
         stop = min(start + _ROWS, height)
-        # The last rows alone may be too few for a window.
+        # Include rows above, because the last rows alone may be too few for a window.
         first = max(min(start - RADIUS, height - WINDOW), 0)
         last = min(stop + RADIUS, height)
         _, full = structural_similarity(

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 _BAR = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
 
-#: Counts that most steps report and that are therefore not shown.
+#: Counts that are not shown, because most steps report them.
 _OF_AGGREGATION = frozenset({"zero", "disjoint", "dropped", "conflict"})
 
 
@@ -50,7 +50,7 @@ class Progress(Observer):
         10.0, gt=0.0, description="seconds between lines if the output is not a terminal"
     )
 
-    # The state of the display; it is not part of the run's state.
+    # The state of the display. It is not part of the run's state.
     _pace: Pace = PrivateAttr(default_factory=lambda: Pace(1))
     _tenth: int = PrivateAttr(default=1)
     _bar: "tqdm[Any] | None" = PrivateAttr(default=None)
@@ -155,5 +155,5 @@ class Progress(Observer):
             sys.stderr.write(text + "\n")
             sys.stderr.flush()
         else:
-            # `tqdm` writes the line above the bar; otherwise the line would break the bar.
+            # `tqdm` writes the line above the bar. A normal print would break the bar.
             self._bar.write(showable(text), file=controls_of(sys.stderr))

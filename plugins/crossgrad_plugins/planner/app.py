@@ -23,13 +23,14 @@ from crossgrad_plugins.planner.finding import Finding
 from crossgrad_plugins.planner.length import length
 from crossgrad_plugins.planner.planner import Plan, plan_of
 
-#: In narrower terminals, the cost and the option of a part are printed below its evidence.
+#: In terminals narrower than this, the cost and the option of a part are printed below its
+#: evidence.
 _WIDE: Final = 110
 _HEADER: Final = ("part", "decision", "evidence", "cost saved", "force with")
-#: Widths of the columns of a wide table; the evidence gets the remaining width.
+#: Widths of the columns of a wide table. The evidence gets the remaining width.
 _WIDTHS: Final = (14, 20, 0, 18, 23)
 _GAP: Final = "  "
-#: Basis of a choice -> text that follows the choice.
+#: Basis of a choice -> text that is printed after the choice.
 _MARKS: Final = {"decided": "", "default": " (default)", "given": " (yours)"}
 
 
@@ -113,7 +114,8 @@ def plan(
     scene, _ = read_scene(config)
     made = plan_of(config, scene, probe_seconds)
     if write is not None:
-        # The bundled scene has its own length, which would be lost if the file names the scene.
+        # Write the time limit too, because the bundled scene has its own default length. This
+        # default is lost if the file names the scene.
         seconds = {} if config.seconds is None else {"seconds": config.seconds}
         # An absolute path, so that the file also works from another folder.
         asked = {**settings, **seconds, "scene": str(Path(str(config.scene)).resolve())}
@@ -160,7 +162,7 @@ def show(made: Plan, way: str, *, as_json: bool) -> None:
         print(json.dumps(made.as_data(), indent=2))  # noqa: T201
         return
     for line in lines_of(made, get_terminal_size((_COLUMNS, 0)).columns):
-        print(one_line(line))  # noqa: T201 - the result of the command
+        print(one_line(line))  # noqa: T201 - print the result of the command
     print(one_line(way))  # noqa: T201
 
 

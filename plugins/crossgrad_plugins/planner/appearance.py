@@ -9,10 +9,10 @@ from crossgrad_plugins.planner.finding import Finding, given
 #: View dependence is worth its cost only if it explains at least this share of the variance of
 #: tracks.
 LEAST_SHARE: Final = 0.02
-#: Numbers per Gaussian without higher bands: position, shape, opacity, colour.
+#: Number of values per Gaussian without higher bands: position, shape, opacity and colour.
 _OTHER_NUMBERS: Final = 14
-#: If the largest footprint is less than this many times the smallest, all photos show the scene at
-#: one scale.
+#: If the largest footprint is less than this many times the smallest footprint, all photos show the
+#: scene at one scale.
 ONE_SCALE: Final = 2.0
 
 

@@ -33,8 +33,8 @@ class Evidence:
             names: Settings, such as `exposure`, `data.init` or `backbone.sh_degree`.
         """
         settings = {n for n in self.config.model_fields_set if getattr(self.config, n) is not None}
-        # A run also stores its defaults; in the group `data`, a default value therefore counts as
-        # not set.
+        # A run also stores its defaults. In the group `data`, a setting with its default value
+        # therefore counts as not set.
         data, defaults = self.config.data, type(self.config.data)()
         settings |= {
             f"data.{n}" for n in data.model_fields_set if getattr(data, n) != getattr(defaults, n)

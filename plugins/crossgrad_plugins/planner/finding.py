@@ -9,12 +9,12 @@ from crossgrad_core.plugin import Decision, Json
 
 #: Name -> value of the evidence.
 Figures: TypeAlias = Mapping[str, float]
-#: Setting, or option of a component -> value.
+#: Name of a setting or of a component's option -> value.
 Settings: TypeAlias = Mapping[str, Json]
 #: Origin of a choice. `decided`: the evidence decided. `default`: the evidence is missing or not
 #: conclusive, so the default is used. `given`: the user set it.
 Basis: TypeAlias = Literal["decided", "default", "given"]
-#: Text for the saving of a choice that a run without a planner also makes.
+#: The saving of a choice is shown with this text if a run without a planner makes the same choice.
 NOTHING = "-"
 
 

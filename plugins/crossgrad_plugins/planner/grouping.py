@@ -13,15 +13,16 @@ from crossgrad_plugins.planner.modes import FEWEST, LEAST_RATIO, LEAST_SHARE, ON
 if TYPE_CHECKING:
     from crossgrad_plugins.planner.probe import Probe
 
-#: Minimum sigma_b^2 / sigma_w^2 for pairs: pairs remove this share of a step's gradient variance.
+#: Minimum sigma_b^2 / sigma_w^2 for which pairs are used. Pairs remove this share of a step's
+#: gradient variance.
 LEAST_RHO: Final = 0.1
-#: Minimum share of views in the smaller mode for pairs. Pairs weight both modes equally, so with a
-#: smaller share, training would optimize another objective.
+#: Minimum share of views in the smaller mode for which pairs are used. Pairs weight both modes
+#: equally. With a smaller share, training would optimize another objective.
 EVEN: Final = 0.4
-#: Share of conflicts between gradients with independent directions.
+#: Expected share of conflicts if gradients have independent directions.
 CHANCE: Final = 0.5
 
-#: Groups of a sampler that draws near and far views.
+#: Number of groups of a sampler that draws near and far views.
 _BOTH: Final = 2
 _TWO_VIEWS: Final = "docs/results/two-views.md"
 #: Rows of docs/results/two-views.md and docs/results/paper.md.

@@ -8,7 +8,8 @@ from crossgrad_plugins.planner.finding import Finding, given
 from crossgrad_plugins.planner.grouping import views_of_steps
 
 _EXACTLY: Final = "--steps N or --max-views N"
-#: Views per training photo, and minimum of all views, beyond which more views gain little.
+#: Number of views per training photo, and minimum number of all views. More views than both values
+#: gain little.
 PASSES: Final = 100
 FEWEST_VIEWS: Final = 1_000
 

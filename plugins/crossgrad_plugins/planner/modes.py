@@ -12,13 +12,14 @@ from crossgrad_core.plugin import Scene, bimodality, footprint_of
 from crossgrad_plugins.groupings.heights import altitudes, upward
 from crossgrad_plugins.groupings.split import log_distances, otsu_separability, otsu_threshold
 
-#: If the ratio of their distances is smaller, two modes show the scene at nearly the same size.
+#: If the ratio of the distances of two modes is smaller than this, both modes show the scene at
+#: nearly the same size.
 LEAST_RATIO: Final = 1.5
 #: Minimum number of views to detect two modes.
 FEWEST: Final = 10
-#: Minimum share of views in the smaller mode; a smaller group is treated as outliers.
+#: Minimum share of views in the smaller mode. A smaller group is treated as outliers.
 LEAST_SHARE: Final = 0.1
-#: About one of this many evenly spread samples separates as well as two modes do.
+#: About one of this many samples from a uniform distribution separates as well as two modes do.
 ONE_OF: Final = 100
 #: The kind of distance that is used if views show SfM points.
 DEPTH: Final = "depth over focal length"
@@ -26,9 +27,10 @@ FROM_THE_MEAN: Final = "distance from the mean camera"
 HEIGHT: Final = "height"
 #: Quantity -> the grouping that splits views by it.
 _GROUPINGS: Final = {DEPTH: "footprint", FROM_THE_MEAN: "radial", HEIGHT: "altitude"}
-#: Number of evenly spread samples, and their maximum size; larger samples separate no better.
+#: Number of samples from a uniform distribution, and their maximum size. Larger samples separate no
+#: better.
 _TRIALS, _LARGEST = 1000, 1000
-#: Largest logarithm whose exponential is finite.
+#: Largest number whose exponential is finite.
 _MOST: Final = 700.0
 
 _Floats = NDArray[np.float64]

@@ -52,7 +52,8 @@ class Plan:
         """Return a run's settings in their long form, with the planned changes."""
         decided, seconds = dict(self.settings), settings.get("seconds")
         if "max_views" in decided and seconds is not None:
-            # A layer with a length replaces the lengths of earlier layers.
+            # Merge the settings in layers. A layer with a length replaces the lengths of earlier
+            # layers.
             decided["seconds"] = seconds
         return layered([settings, decided])
 

@@ -14,9 +14,9 @@ from crossgrad_core.commands import (
 from crossgrad_plugins.diagnostics.app import Options, diagnose_scene
 from crossgrad_plugins.diagnostics.table import ALL, Row, rows_of
 
-#: The optimizer sees gradients in Adam's metric.
+#: Gradients are measured in Adam's metric, because the optimizer is Adam.
 _METRIC: Final = "adam"
-#: Half of a 95 % interval in standard errors.
+#: Half of the width of a 95 % interval, in standard errors.
 _WIDE: Final = 1.96
 
 

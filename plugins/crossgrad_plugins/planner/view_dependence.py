@@ -11,15 +11,15 @@ from crossgrad_core.plugin import Scene
 from crossgrad_plugins.exposures.tracks.gains import fitted
 from crossgrad_plugins.exposures.tracks.observations import Observations, observations_of
 
-#: Minimum number of observations of a track (twice the coefficients of degree 1), and minimum
-#: radius, in degrees, of the cone of its directions.
+#: Minimum number of observations of a track (twice the number of coefficients of degree 1). Minimum
+#: radius, in degrees, of the cone of its viewing directions.
 LEAST_OBSERVATIONS: Final = 8
 LEAST_RADIUS: Final = 10.0
-#: Minimum number of tracks for a useful interval, and maximum number of tracks used.
+#: Minimum number of tracks for a useful interval, and maximum number of tracks that are used.
 FEWEST_TRACKS: Final = 100
 _MOST_TRACKS: Final = 3_000
 #: Regularization of the coefficients of degree 1, relative to the number of observations, because
-#: the directions of a narrow cone are nearly the same.
+#: the viewing directions in a narrow cone are nearly equal.
 _RIDGE: Final = 0.01
 _DRAWS: Final = 400
 

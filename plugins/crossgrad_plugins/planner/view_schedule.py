@@ -13,7 +13,8 @@ from crossgrad_plugins.planner.finding import Finding, given
 from crossgrad_plugins.planner.grouping import EVEN, pairs, settings_of
 from crossgrad_plugins.planner.length import most_views
 
-#: Far views per near view in the first part of a run; sampler `horizon` defines that part.
+#: Number of far views per near view in the first part of a run. The sampler `horizon` defines this
+#: part.
 FAR_TO_NEAR: Final = 5
 #: Maximum angle of far views and minimum angle of near views, in degrees from the mean direction of
 #: the far views.

@@ -46,7 +46,8 @@ _MOST_POINTS, _MOST_LINKS = 20_000, 4_000
 #: Points beyond these percentiles are not drawn.
 _INNER: Final = (1.0, 99.0)
 _MARGIN: Final = 0.15
-#: Titles of both panels for a scene that is not georeferenced, so its vertical is unknown.
+#: Titles of both panels for a scene that is not georeferenced. The vertical of such a scene is
+#: unknown.
 _TITLES: Final = ("first and second axis of the cameras", "first and third axis of the cameras")
 
 
@@ -143,7 +144,7 @@ def prepare_scene(photos: Path, scene: Path, settings: Settings, threads: int | 
     """
     report = prepared(photos, scene, settings, threads)
     for line in summary_lines(report):
-        print(one_line(line))  # noqa: T201 - the result of the command
+        print(one_line(line))  # noqa: T201 - print the result of the command
     print(one_line(f"scene in {scene}; the report is {scene / 'report.md'}"))  # noqa: T201
     length, command = advised(scene)
     print(f"planned length: {length}")  # noqa: T201
@@ -166,9 +167,9 @@ def prepared(photos: Path, scene: Path, settings: Settings, threads: int | None 
     layout = Layout(scene)
     check_ours(layout, photos)
     _check_lens(settings.lens)
-    # A finished scene no longer needs its photos.
+    # If the scene is already complete, its photos are no longer needed.
     plan = _planned(photos, settings, fewest=0 if layout.is_ready else 2)
-    # Write nothing, because others may read the folder, and the disk may be read-only.
+    # Write nothing here, because other processes may read the folder and the disk may be read-only.
     if layout.is_ready:
         return _carried_out(layout, agreed(layout, plan), 1)
     matching.check_gps(plan)

@@ -14,14 +14,15 @@ from crossgrad_plugins.prepare.pycolmap_calls import quiet
 if TYPE_CHECKING:
     import pycolmap
 
-#: Minimum number of verified matches of a counted pair, the same as COLMAP requires for a pose.
-#: With fewer matches, most pairs of photos of repeated walls and pavements are wrong.
+#: A pair of photos counts if it has at least this many verified matches. COLMAP requires the same
+#: number for a pose. With fewer matches, most pairs of photos of repeated walls and pavements are
+#: wrong.
 _MATCHES: Final = 30
 #: Maximum distance in pixels between a match and its epipolar line, as in verification. Two poses
-#: agree with a pair if at least this share of its matches is within the distance.
+#: agree with a pair if at least this share of its matches is within this distance.
 _PIXELS, _AGREEING = 4.0, 0.5
 #: A photo is misplaced if less than this share of its matches agrees, and if at least this many of
-#: its pairs disagree. One pair alone can be wrong.
+#: its pairs with other photos disagree. One pair alone can be wrong.
 _SHARE, _AGAINST = 1.0 / 3.0, 2
 
 

@@ -14,17 +14,18 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-#: Degrees of longitude in half a turn.
+#: Half a turn in degrees of longitude.
 _HALF = 180.0
-#: Camera axes (x right, y down) that point to the top of a photo, by EXIF orientation.
+#: EXIF orientation -> camera axis (x right, y down) that points to the top of the photo.
 _TOPS: Final = {3: (0.0, 1.0, 0.0), 4: (0.0, 1.0, 0.0), 5: (-1.0, 0.0, 0.0), 6: (-1.0, 0.0, 0.0),
                 7: (1.0, 0.0, 0.0), 8: (1.0, 0.0, 0.0)}  # fmt: skip
 _TOP: Final = (0.0, -1.0, 0.0)
 _STEPS: Final = 1440
-#: Limits for the sine of the tilt of level photos (root mean square): the greatest at the best
-#: roll, and the least difference between best and worst roll that determines the roll.
+#: Limits for the root mean square of the sine of the tilt of level photos. The first value is the
+#: maximum at the best roll. The second value is the minimum difference between the best and the
+#: worst roll that determines the roll.
 _LEVEL, _TELLING = 0.15, 0.3
-#: Minimum average amount by which photos show their top upwards or look down.
+#: Minimum mean amount by which the top of the photos points upwards or the photos look down.
 _UPRIGHT: Final = 0.3
 
 
@@ -35,7 +36,7 @@ def origin_of(plan: Plan) -> Position | None:
         return None
     longitudes = [position.longitude for position in positions]
     if max(longitudes) - min(longitudes) > _HALF:
-        # The photos are on both sides of the date line.
+        # If this is true, the photos are on both sides of the date line.
         longitudes = [longitude % (2 * _HALF) for longitude in longitudes]
     east = median(longitudes)
     return Position(
@@ -102,8 +103,8 @@ def levelled(
     if tilts.max() - tilts.min() < _TELLING or tilts.min() > _LEVEL:
         return None
     upright = (_heights(up, along, angles) - _heights(ahead, along, angles)).mean(axis=0)
-    # After half a turn, the photos are equally level, but they are upside down in one of the two
-    # positions.
+    # If the frame is rotated by half a turn, the photos are equally level. In one of the two
+    # positions, they are upside down.
     best = int(np.argmin(np.where(upright > _UPRIGHT, tilts, np.inf)))
     if upright[best] <= _UPRIGHT or tilts[best] > _LEVEL:
         return None

@@ -20,17 +20,18 @@ if TYPE_CHECKING:
 
 #: Longest side in pixels of the reduced photos in which features are found (COLMAP's default).
 LONGEST: Final = 3200
-#: Memory that SIFT needs per pixel in bytes, including its upscaling to twice the size (measured
-#: in docs/prepare.md). Bytes per pixel of the decoded file, in colour and grey. Greatest share of
-#: the free memory for all threads together.
+#: Number of bytes per pixel that SIFT needs, including its upscaling to twice the size (measured in
+#: docs/prepare.md). Number of bytes per pixel of the decoded file, in colour and grey. Maximum
+#: share of the free memory for all threads together.
 _BYTES_PER_PIXEL, _BYTES_DECODED, _SHARE = 320, 4, 0.6
-#: Photos with fewer pixels yield few features, so SIFT also accepts fainter features and features
-#: along edges: contrast threshold and ratio of curvatures (COLMAP's defaults: 0.0067 and 10).
+#: Photos with fewer pixels than this yield few features. For them, SIFT also accepts fainter
+#: features and features along edges. The other two values are the contrast threshold and the ratio
+#: of curvatures (COLMAP's defaults: 0.0067 and 10).
 _SMALL, _FAINT, _ALONG_EDGES = 1e6, 0.002, 20.0
-#: Bytes of a feature in the database, and stored features per requested feature. A feature with
-#: several orientations is stored several times.
+#: Number of bytes of a feature in the database, and number of stored features per requested
+#: feature. A feature with several orientations is stored several times.
 _BYTES_OF_FEATURE, _ORIENTATIONS = 152, 1.6
-#: Greatest number of photos of a camera that are tried until one can be read.
+#: Maximum number of photos of a camera that are tried until a photo can be read.
 _TRIED: Final = 5
 
 

@@ -11,12 +11,12 @@ from typing import Final
 from crossgrad_plugins.prepare.matching import Link
 from crossgrad_plugins.prepare.plan import Photo, Plan
 
-#: A photo with fewer features than this, or than this share of the median, is reported, as is a
-#: photo with less than this share of the median sharpness.
+#: A photo is reported in three cases: it has fewer features than the first number, fewer features
+#: than this share of the median, or less than this share of the median sharpness.
 _FEW, _LOW_SHARE, _BLURRED_SHARE = 200, 0.25, 0.2
 _DARK, _BRIGHT = 30.0, 235.0
-#: Greatest factor between the heights of successive photos on a ramp between two regimes. SIFT
-#: matches photos well if their scales differ by less than 1.5 (docs/prepare.md).
+#: Maximum factor between the heights of successive photos on a ramp between two regimes. SIFT
+#: matches photos well if their scales differ by less than a factor of 1.5 (docs/prepare.md).
 _RUNG: Final = 1.4
 _MOST_RUNGS: Final = 12
 
@@ -182,7 +182,8 @@ def bridges_of(
     main, grouped = parts[0], dict[str, set[str]]()
     for part in parts[1:]:
         if part - main:
-            # One bridge is enough for all pieces of a folder.
+            # Suggest one bridge for all unconnected parts of a folder, because one bridge is
+            # enough.
             grouped.setdefault(_folders(plan, part - main), set()).update(part - main)
     return tuple(_bridge(plan, links, (main, frozenset(p)), heights) for p in grouped.values())
 

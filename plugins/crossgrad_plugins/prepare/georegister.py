@@ -13,18 +13,18 @@ from crossgrad_plugins.prepare.pycolmap_calls import quiet
 if TYPE_CHECKING:
     import pycolmap
 
-#: Least number of photos with GPS for a similarity.
+#: Minimum number of photos with GPS for a similarity.
 FEWEST: Final = 3
-#: Assumed GPS errors in metres, from a good receiver to a phone between houses. The first error
-#: with which most photos agree is used.
+#: Assumed GPS errors in metres, from a good receiver to a phone between houses. The first error in
+#: this list with which most photos agree is used.
 _ERRORS: Final = (3.0, 10.0, 30.0)
 _AGREEING: Final = 0.6
-#: Photos must be this many GPS errors apart across their main direction. A spread along the main
-#: direction is enough only if the photos show the upward direction.
+#: Photos must be this many GPS errors apart in the direction across their main direction. If the
+#: photos show the upward direction, a spread along the main direction is enough.
 _SPREAD: Final = 3.0
 #: Cameras are on a line if their spread across it is below this share of the spread along it.
 _STRAIGHT: Final = 0.05
-#: Greatest number of photos on a line that are compared with each other.
+#: Maximum number of photos on a line that are compared with each other.
 _ASKED: Final = 1_000
 
 

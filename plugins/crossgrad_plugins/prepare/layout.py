@@ -15,7 +15,7 @@ from crossgrad_core.commands import (
 )
 from crossgrad_plugins.prepare.pycolmap_calls import is_whole
 
-#: The folder of intermediate files, and the file that shows that `prepare` made it.
+#: The folder of intermediate files, and the file that shows that `prepare` made this folder.
 WORK: Final = "prepare"
 PLAN: Final = "plan.json"
 
@@ -136,7 +136,8 @@ def check_ours(layout: Layout, photos: Path) -> None:
         )
     if layout.plan.is_file() or not scene.is_dir():
         return
-    # Accept only the lock and temporary plan files that a killed process left.
+    # Continue only if the folder contains nothing but the lock and temporary plan files of a killed
+    # process.
     left = [path for path in scene.iterdir() if path.name not in {WORK, "run.lock"}]
     if left or (layout.work.is_dir() and any(not _is_hidden(p) for p in layout.work.iterdir())):
         raise UserError(

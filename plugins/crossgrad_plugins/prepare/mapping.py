@@ -23,8 +23,9 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-#: Minimum number of points for a pose, as in COLMAP's incremental mapping. Minimum number of points
-#: that two photos of a model share, directly or through other photos, as for a verified pair.
+#: First value: minimum number of points for a pose, as in COLMAP's incremental mapping. Second
+#: value: minimum number of points that two photos of a model share, directly or through other
+#: photos, as for a verified pair.
 _POINTS, _SHARED = 30, 15
 
 
@@ -77,10 +78,11 @@ def _only(model: "pycolmap.Reconstruction", part: frozenset[int]) -> "pycolmap.R
     return alone
 
 
-#: Minimum number of photos for global mapping: for one folder, and for several folders. Few matches
-#: may join folders, and global mapping then misplaces such parts (docs/prepare.md).
+#: Minimum number of photos for global mapping: first value for one folder, second value for several
+#: folders. Often only few matches connect two folders, and global mapping then misplaces a folder
+#: (docs/prepare.md).
 _MANY, _MANY_OF_FOLDERS = 100, 1000
-#: Least number of photos in a model.
+#: Minimum number of photos in a model.
 _SMALLEST: Final = 3
 Models = Mapping[int, "pycolmap.Reconstruction"]
 

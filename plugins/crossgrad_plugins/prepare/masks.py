@@ -19,13 +19,13 @@ from crossgrad_core.scene.photos.shapes import check_mask, is_turned
 from crossgrad_core.scene.wording import count, name_some
 from crossgrad_plugins.prepare.plan import LeftOut, Photo, digest_of
 
-#: Folders with this name contain masks. Files next to photos are masks if their stem ends like
-#: this.
+#: Folders with this name contain masks. A file next to a photo is a mask if its stem has one of
+#: these endings.
 _MASKS: Final = "masks"
 _ENDS: Final = ("_mask", ".mask")
-#: The level of a mask or of transparency below which a pixel does not count.
+#: If a mask or the opacity of a pixel has a level below this, the pixel does not count.
 HALF: Final = 128
-#: EXIF orientations that rotate a photo by a quarter turn -> orientations that undo the rotation.
+#: EXIF orientations that rotate a photo by a quarter turn -> orientations that undo this rotation.
 _BACK: Final = {5: 5, 6: 8, 7: 7, 8: 6}
 
 
@@ -72,7 +72,8 @@ def sorted_out(root: Path, files: Sequence[str], wanted: Path | None) -> Sorted:
         masks = _usual(root, photos, folders)
     else:
         masks = _wanted(root, photos, wanted)
-        # The mask folder may be the folder of the photos.
+        # Remove masks from the list of photos, because the mask folder may be the folder of the
+        # photos.
         taken = frozenset(map(os.path.realpath, masks.values()))
         photos = [name for name in photos if os.path.realpath(root / name) not in taken]
         masks = {name: masks[name] for name in photos if name in masks}

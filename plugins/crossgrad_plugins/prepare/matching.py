@@ -17,11 +17,13 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-#: Number of visual words, and of features from which they are made. faiss requires 39 per word.
+#: Number of visual words, and number of features from which the words are made. faiss requires 39
+#: features per word.
 _WORDS, _SAMPLE = 2048, 100_000
-#: Iterations of k-means, in one round, because approximate words are good enough.
+#: Number of k-means iterations in a single round. One round is enough, because approximate words
+#: are good enough.
 _ITERATIONS: Final = 20
-#: Number of values of a feature, and of its embedding in the index (pycolmap).
+#: Number of values of a feature, and number of values of its embedding in the index (pycolmap).
 _SIFT, _EMBEDDED = 128, 64
 
 
@@ -75,24 +77,27 @@ def _sample(layout: Layout) -> NDArray[np.float32]:
     return np.concatenate(parts)
 
 
-#: Maximum number of photos for matching all pairs: always; without GPS; and without GPS if the
-#: photos are in several folders, which only few pairs may connect.
+#: Maximum number of photos for which all pairs are matched. The first value applies to all scenes,
+#: the second to scenes without GPS. The third applies to scenes without GPS whose photos are in
+#: several folders, because only few pairs may connect the folders.
 _FEW, _SOME, _SOME_OF_FOLDERS = 60, 100, 250
-#: Least share of photos with GPS for choosing neighbours by GPS.
+#: Neighbours are chosen by GPS only if at least this share of the photos has GPS.
 _MOST_LOCATED: Final = 0.9
-#: Number of photos that each photo is compared with: nearest by GPS, most alike, next by name.
+#: Number of photos with which each photo is compared: the nearest by GPS, the most similar, and the
+#: next by name.
 _NEAREST, _ALIKE, _NEXT = 40, 40, 5
-#: Number of next photos by name if nothing else determines neighbours.
+#: Number of following photos, in the order of names, that are neighbours of a photo. It applies if
+#: neither GPS nor similarity determines the neighbours.
 _NEXT_ALONE: Final = 20
-#: Maximum distance of neighbours by GPS in metres. Wrong GPS positions therefore give no
-#: neighbours.
+#: Maximum distance in metres between neighbours by GPS. A photo with a wrong GPS position therefore
+#: has no neighbours by GPS.
 _FARTHEST: Final = 500.0
-#: Greatest number of features of a photo that are used to look up similar photos.
+#: Maximum number of features of a photo that are used to find similar photos.
 _LOOKED_UP: Final = 2000
-#: Greatest number of geometries that are tried for the matches of a pair. COLMAP tries five times
-#: as many for pairs that share no content.
+#: Maximum number of geometries that are tried for the matches of a pair. For a pair that shares no
+#: content, COLMAP tries five times as many.
 _TRIALS: Final = 2000
-#: Bytes of a pair in the database for each requested feature of a photo.
+#: Number of bytes of a pair in the database for each requested feature of a photo.
 _BYTES_OF_PAIR: Final = 2
 #: Method for choosing photos to compare -> pycolmap's pairing methods.
 _WAYS: Final = {
@@ -210,7 +215,8 @@ def _pairing(method: str, layout: Layout, way: str, threads: int) -> object:
     options: Any
     if method == "spatial":
         options = pycolmap.SpatialPairingOptions()
-        # Photos from the ground are neighbours of aerial photos above them.
+        # Ignore the altitude, so that photos from the ground are neighbours of aerial photos above
+        # them.
         options.ignore_z = True
         options.max_num_neighbors, options.max_distance = _NEAREST, _FARTHEST
     elif method == "vocabtree":

@@ -72,13 +72,14 @@ _IMPOSSIBLE: Final = (
     "its name has control characters or backslashes, is too long or is not UTF-8: rename it"
 )
 _SMALLEST: Final = 64
-#: A JPEG file may have this many times the usual limit of pixels: phones have 200 megapixels.
+#: A JPEG file may have this many times as many pixels as other photos, because phones take photos
+#: of 200 megapixels.
 _REDUCIBLE: Final = 2
 #: Approximate longest side in pixels of the reduced photos that are inspected.
 _LOOKED_AT: Final = 1024
 _AT_ONCE: Final = 4
-#: Lock for large photos (a fixed share of the maximum size), so that they are decoded one at a
-#: time.
+#: Large photos are those above a fixed share of the maximum size. This lock makes sure that they
+#: are decoded one at a time.
 _LARGE: Final = Lock()
 Tell = Callable[[int, int], None]
 
@@ -176,7 +177,8 @@ def _listed(names: Iterable[str]) -> tuple[list[str], list[LeftOut]]:
         if suffix in _UNREAD:
             what = suffix[1:].upper()
             left_out.append(LeftOut(name=_shown(name), why=f"{what} cannot be read: save as JPEG"))
-        # The mask's name has one more suffix. COLMAP models may come from Windows.
+        # Test the name of the photo's mask, which has one more suffix. Backslashes occur in COLMAP
+        # models from Windows.
         elif "\\" in name or not is_possible_name(f"{name}.png"):
             left_out.append(LeftOut(name=_shown(name), why=_IMPOSSIBLE))
         else:
@@ -262,7 +264,7 @@ def _look(image: "Image", header: PhotoHeader) -> tuple[float, float, bool]:
     """Return brightness (mean grey), sharpness (mean squared Laplacian) and transparency."""
     longest = max(image.size)
     image.draft("L", (image.width * _LOOKED_AT // longest, image.height * _LOOKED_AT // longest))
-    # The core also ignores transparency of photos with more than 8 bits.
+    # Skip photos with more than 8 bits, because the core also ignores their transparency.
     transparent = False
     if header.alpha and not image.mode.startswith(("I", "F")):
         least, _ = image.convert("RGBA").getchannel("A").getextrema()

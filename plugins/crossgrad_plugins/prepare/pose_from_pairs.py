@@ -20,18 +20,20 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-#: Least number of verified matches of a pair, the share of its matches that has to agree with two
-#: poses, and the largest distance in pixels to an epipolar line for agreement. This distance is
-#: larger than in verification, because a pose is not exact before bundle adjustment.
+#: Minimum number of verified matches of a pair, share of its matches that must agree with two
+#: poses, and maximum distance in pixels between an agreeing match and its epipolar line. This
+#: distance is larger than in verification, because a pose is not exact before bundle adjustment.
 _MATCHES, _AGREEING, _PIXELS = 15, 0.5, 6.0
-#: A pose needs at least this many pairs and this many agreeing matches, in one of two combinations.
+#: A pose needs a minimum number of pairs and a minimum number of agreeing matches. One of these two
+#: combinations must be reached.
 _NEEDED: Final = ((3, 60), (2, 100))
-#: Number of a photo's pairs, with the most matches first, that give candidate poses.
+#: Number of a photo's pairs that give candidate poses. The pairs with the most matches are used.
 _ASKED: Final = 16
-#: Least number of points that determine a distance, and the quantiles of distances that are tried.
+#: Minimum number of points that determine a distance, and quantiles of the distances that are
+#: tried.
 _POINTS, _QUANTILES = 4, (0.35, 0.5, 0.65)
-#: Two directions intersect if their rotations differ by at most 5 degrees and their directions by
-#: at least 2 degrees. Both values are cosines.
+#: Two directions are intersected if their rotations differ by at most 5 degrees and the directions
+#: differ by at least 2 degrees. Both values are cosines of these angles.
 _SAME_ROTATION, _SAME_DIRECTION = 0.9962, 0.9994
 
 
@@ -77,7 +79,8 @@ class PairView:
 
         options = pycolmap.TwoViewGeometryOptions()
         options.compute_relative_pose, options.ransac.random_seed = True, 0
-        # Verification already searched for watermarks, and these cameras have no borders.
+        # Do not search for watermarks again: verification did this already, and these cameras have
+        # no borders.
         options.detect_watermark = False
         cameras = [
             pycolmap.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[focal, 0, 0])
@@ -249,7 +252,7 @@ def _distances(
     offsets = np.stack(positions) - sight.pose.inverse().translation
     rays = np.column_stack([sight.rays[1][rows], np.ones(len(rows))]) @ rotation
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    # Perpendicular to the ray to a point, offset and direction are parallel.
+    # In the plane perpendicular to the ray to a point, offset and direction are parallel.
     across = direction - rays * (rays @ direction)[:, None]
     beside = offsets - rays * (rays * offsets).sum(axis=1, keepdims=True)
     square = (across**2).sum(axis=1)
@@ -317,8 +320,8 @@ def off_lines(
     here, there = (np.column_stack([points, np.ones(len(points))]) for points in rays)
     lines, back = here @ essential.T, there @ essential
     error = np.abs((there * lines).sum(axis=1))
-    # Two photos with the same centre have no epipolar lines, so their matches cannot contradict the
-    # poses.
+    # Two photos with the same centre have no epipolar lines, so their matches cannot contradict
+    # their poses.
     tiny = np.finfo(np.float64).tiny
     in_other = error / np.maximum(tiny, np.hypot(lines[:, 0], lines[:, 1])) * focals[1]
     in_one = error / np.maximum(tiny, np.hypot(back[:, 0], back[:, 1])) * focals[0]

@@ -23,21 +23,21 @@ if TYPE_CHECKING:
 
 
 T = TypeVar("T")
-#: Seconds between two checks of a call, and between two progress messages.
+#: Seconds between two checks of a running call, and seconds between two progress messages.
 _LOOK, _PAUSE = 0.1, 10.0
-#: Program that counts the rows of a table, and the seconds after which it is stopped.
+#: Program that counts the rows of a table. It is stopped after `_PATIENCE` seconds.
 _COUNT: Final = (
     "import sqlite3, sys; found = sqlite3.connect(sys.argv[1] + '?mode=ro', uri=True);"
     "print(*found.execute('SELECT COUNT(*) FROM ' + sys.argv[2]).fetchone())"
 )
 _PATIENCE: Final = 5.0
-#: Greatest size in bytes of the journal that SQLite writes next to a database.
+#: Maximum number of bytes of the journal that SQLite writes next to a database.
 JOURNAL: Final = 2**23
-#: Glog's level of fatal messages. Lower levels do not concern the user: a failure raises an
-#: exception, or leaves a file missing.
+#: Glog's level of fatal messages. Messages of lower levels are not useful to the user, because a
+#: failure raises an exception or leaves a file missing.
 _FATAL: Final = 3
-#: Files of a model that the reader does not check -> bytes of a record. All records are equal in
-#: size, because each rig of `prepare` is one camera, and each frame is one photo.
+#: Files of a model that the reader does not check -> number of bytes of a record. All records are
+#: equal in size, because each rig of `prepare` is one camera, and each frame is one photo.
 _RECORDS: Final = {"rigs.bin": 16, "frames.bin": 84}
 _COUNT_OF_RECORDS: Final = struct.Struct("<Q")
 

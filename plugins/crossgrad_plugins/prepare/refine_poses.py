@@ -25,17 +25,19 @@ from crossgrad_plugins.prepare.pycolmap_calls import JOURNAL, write_model
 if TYPE_CHECKING:
     import pycolmap
 
-#: Greatest number of rounds over all doubtful photos.
+#: Maximum number of rounds over all doubtful photos.
 _ROUNDS: Final = 5
-#: A photo is doubtful if a smaller share of its matches agrees with its pose. Another pose must
-#: have this many times as many agreeing matches.
+#: A photo is doubtful if less than the first share of its matches agrees with its pose. Another
+#: pose replaces it if the other pose has at least the second value times as many agreeing matches.
 _DOUBTFUL, _BETTER = 0.6, 1.3
-#: Least and greatest focal length in photo sizes, and greatest distortion: COLMAP's own limits.
+#: Minimum and maximum focal length in photo sizes, and maximum distortion. These are COLMAP's own
+#: limits.
 _POSSIBLE: Final = (0.1, 10.0, 1.0)
 _LOG = logging.getLogger(__name__)
 
 Models: TypeAlias = "list[pycolmap.Reconstruction]"
-#: Triangulates points of the model in a folder again, by a database, and continues mapping.
+#: Function that triangulates the points of a model again and continues mapping. It receives the
+#: folder of the model and the database.
 Adjust: TypeAlias = "Callable[[Path, Path], pycolmap.Reconstruction]"
 Poses: TypeAlias = "Mapping[int, pycolmap.Rigid3d]"
 
@@ -104,7 +106,8 @@ def looked_again(
             break
         _leave_out_impossible(main)
         look = again.look(main)
-        # Evidence for a single photo may no longer be valid after all photos have moved.
+        # Look at all photos again. The evidence for a single photo may no longer be valid after all
+        # photos have moved.
         if look.agreeing >= seen.agreeing:
             best, seen, gone = main, look, moved
     here = set(best.reg_image_ids())
@@ -188,7 +191,7 @@ class _Again:
         A photo is left out if too few pairs agree with its pose after all photos are moved.
         """
         if not self.copy.exists():
-            # SQLite aborts the process on a full disk.
+            # Check the free space first, because SQLite aborts the process on a full disk.
             check_folder(self.copy.parent, self._database.stat().st_size + JOURNAL)
             shutil.copyfile(self._database, self.copy)
         with _opened(self._database) as database, _opened(self.copy) as copied:
@@ -199,7 +202,7 @@ class _Again:
                 if not support(pairs.sights(photo, poses), poses[photo]).enough:
                     model.deregister_frame(model.image(photo).frame_id)
             against = pairs.contradicting(poses_of(model))
-            # Mapping cannot process photos without a pair.
+            # Remove photos without a pair, because mapping cannot process them.
             for photo in pairs.without(against) & poses_of(model).keys():
                 model.deregister_frame(model.image(photo).frame_id)
             for one, two in sorted(self._aside ^ against):

@@ -21,7 +21,7 @@ from crossgrad_plugins.prepare.results import Result
 
 #: Version of report.json.
 FORMAT: Final = 1
-#: Greatest number of printed lines of one kind. The files contain all lines.
+#: Maximum number of printed lines of one kind. The files contain all lines.
 _SHOWN: Final = 8
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 _FILE: Final = "placed.json"
-#: Percentile of the points' heights that is taken as the ground.
+#: The height of the ground is this percentile of the heights of the points.
 _GROUND: Final = 5.0
 
 

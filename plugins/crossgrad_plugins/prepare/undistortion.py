@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 #: Number of photos that are undistorted between two checks.
 _BATCH: Final = 32
 _QUALITY: Final = 95
-#: Assumed bytes of a photo's pixel on the disk, and of files other than photos and model. A sharp
-#: JPEG photo of this quality needs 0.4 bytes per pixel, and pure noise needs 2.
+#: Assumed number of bytes per pixel of a photo on the disk, and assumed number of bytes of other
+#: files except the model. A sharp JPEG photo of this quality needs 0.4 bytes per pixel, and pure
+#: noise needs 2.
 _BYTES_PER_PIXEL, _BESIDE = 1.0, 2**18
 
 
@@ -112,7 +113,8 @@ def _moved(here: Path, there: Path) -> None:
 
 def _is_written(photo: Path) -> bool:
     """Return True if a photo file exists and is complete."""
-    # A JPEG writer that cannot write aborts the process. Other files may be truncated.
+    # If the JPEG writer cannot write a file, it aborts the process, so an existing JPEG file is
+    # complete. Files in other formats may be truncated.
     if not photo.is_file() or photo.suffix.lower() in {".jpg", ".jpeg"}:
         return photo.is_file()
     try:

@@ -6,7 +6,7 @@ defined by `Rasterizer.speed`.
 
 from typing import Final
 
-#: gswarp, and the package that it requires.
+#: The modules of gswarp and of the package that it requires.
 GSWARP_PACKAGES: Final = ("gswarp", "warp")
 
 

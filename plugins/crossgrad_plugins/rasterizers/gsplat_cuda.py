@@ -118,7 +118,8 @@ class GsplatRasterizer(Rasterizer):
             )
             for view_gaussians, _ in views
         ]
-        # The Gaussians of each view are a separate batch, so that gradients stay separate.
+        # The Gaussians of each view form their own batch, so that the gradients of the views stay
+        # separate.
         tensors = [
             _batch([getattr(view_gaussians, name) for view_gaussians, _ in views])
             for name in _GEOMETRY

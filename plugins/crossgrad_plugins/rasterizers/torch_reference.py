@@ -25,7 +25,8 @@ from crossgrad_plugins.rasterizers.reference.harmonics import view_colors
 from crossgrad_plugins.rasterizers.reference.projection import Projection, Shape, project, shape
 from crossgrad_plugins.rasterizers.reference.statistics import Recorder, longest_axes, recorded
 
-#: Number of standard deviations, and lower bound of the squared half difference of variances, px^4.
+#: Number of standard deviations, and lower bound of the squared half difference of the variances
+#: (px^4).
 SIGMAS, LEAST_SPREAD = 3.0, 0.1
 
 
@@ -98,7 +99,8 @@ class TorchRasterizer(Rasterizer):
         size = (camera.width, camera.height)
         with torch.no_grad():
             index, boxes, published = self._drawn(gaussians, camera)
-        # Gaussians that are not rendered never enter the graph, so that they cannot pass on a NaN.
+        # Gaussians that are not rendered are left out of the graph, so that they cannot pass on a
+        # NaN.
         drawn = _rows(gaussians, index)
         projection, shapes, colors = self._splats(drawn, camera)
         screen = Screen(torch.zeros(len(gaussians), dtype=torch.int32, device=index.device))

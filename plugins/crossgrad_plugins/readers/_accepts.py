@@ -14,12 +14,13 @@ from crossgrad_plugins.readers._columns import Columns, begins_with, head_of, ho
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers.colmap_files.folder import find_models
 
-#: The poses of NeRF synthetic scenes.
+#: The pose file of NeRF synthetic scenes.
 BLENDER_FILE: Final = "transforms_train.json"
 #: The pose file of nerfstudio and of a MatrixCity block, and the key that only MatrixCity uses.
 TRANSFORMS_FILE: Final = "transforms.json"
 _ROTATION: Final = b'"rot_mat"'
-#: Folders that are searched for blocks, and the maximum depth: small_city/aerial/train/block_1.
+#: Folders that are searched for blocks, and the maximum depth of the search. An example is
+#: small_city/aerial/train/block_1.
 _BLOCKS: Final = re.compile(r"aerial|street|train|test|(block|small_city|big_city|bridge).*")
 _DEEPEST: Final = 4
 #: The reconstruction of OpenSfM, and the reconstruction in an OpenDroneMap project.
@@ -28,12 +29,13 @@ OPENSFM_FILES: Final = ("reconstruction.json", "opensfm/reconstruction.json")
 NAME_COLUMN: Final = "name"
 POSE_COLUMNS: Final = ("x", "y", "alt", "heading", "pitch", "roll")
 COLUMNS: Final = frozenset({NAME_COLUMN, *POSE_COLUMNS, "f"})
-#: A file is probably meant as a RealityCapture CSV if it has at least this many of the columns.
+#: If a file has at least this many of the columns, it is probably meant as a RealityCapture CSV.
 _NEARLY: Final = 5
-#: Names in UC-GS scenes: the prefix of a folder of held-out photos, and the word in photo names.
+#: Names in UC-GS scenes: the prefix of a folder of held-out photos, and the word in the names of
+#: held-out photos.
 _TEST: Final = "test"
 _EVAL: Final = re.compile(r"(?<![a-z])eval(?![a-z])")
-#: Greatest number of photo names that are read to recognise a UC-GS scene.
+#: Maximum number of photo names that are read to recognise a UC-GS scene.
 _MOST: Final = 10_000
 
 
@@ -70,7 +72,7 @@ def opensfm(path: Path, names: Sequence[str] = OPENSFM_FILES) -> bool:
     return any(begins_with(path / name, b"[") for name in names)
 
 
-def photos_alone(path: Path) -> bool:  # noqa: ARG001 - no folder is prepared unasked
+def photos_alone(path: Path) -> bool:  # noqa: ARG001 - the answer does not depend on the folder
     """Return False: only `--prepare` reads a folder this way."""
     return False
 

@@ -87,7 +87,8 @@ class Inside:
         plain = self._plain(text, base)
         if plain is None or not is_file(self.scene / plain):
             other = files.find(plain or text)
-            # Keep suffix and case: the photo is matched, and a note is written, later.
+            # Return the name with its own suffix and letter case. A later step matches the photo
+            # and writes a note.
             if other is not None and (plain is None or not same_spelling(plain, other)):
                 return other
         return self.name(text, where, base)

@@ -183,7 +183,8 @@ def _number(value: object) -> float | None:
     """Return a number that is finite and not too large, else None. Booleans give None."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
-    # Compare before the conversion to float: whole numbers in JSON have any number of digits.
+    # Compare before the conversion to float, because whole numbers in JSON can have any number of
+    # digits.
     return float(value) if -FARTHEST <= value <= FARTHEST else None
 
 

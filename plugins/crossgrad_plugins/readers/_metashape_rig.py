@@ -69,7 +69,8 @@ class Rig:
         pose, offset = self.transforms.get(master), self.offsets.get(camera.get("sensor_id", ""))
         if pose is None or offset is None:
             return None
-        # The offsets of all sensors can refer to any sensor of the rig.
+        # The offsets of all sensors refer to one sensor of the rig, which may be any of them.
+        # Convert them to the master camera.
         of_master = self.offsets.get(self.sensors.get(master, ""), _IDENTITY)
         return np.asarray(pose @ np.linalg.inv(of_master) @ offset)
 

@@ -151,7 +151,7 @@ def _completing(frame: Fields, whole: Fields) -> Fields:
               if any(key in frame for key in way)]  # fmt: skip
     frame_is_fisheye = _says_fisheye(frame)
     if frame_is_fisheye is not None and frame_is_fisheye != bool(_says_fisheye(whole)):
-        others += _WAYS[1]  # These are distortion parameters of another kind of lens.
+        others += _WAYS[1]  # Hide distortion parameters that belong to another kind of lens.
     hidden = frozenset[str]().union(*others)
     return replace(whole, value={k: v for k, v in whole.value.items() if k not in hidden})
 
@@ -185,7 +185,7 @@ def _frame(
     across = _focal(holder, "fl_x", "camera_angle_x", width)
     down = _focal(holder, "fl_y", "camera_angle_y", height)
     if across is None:
-        # The error names the horizontal focal length as missing.
+        # The error says that the horizontal focal length is missing.
         other = "camera_angle_y" if "camera_angle_y" in holder("camera_angle_y") else "fl_y"
         holder(other).wrong("fl_x", "a focal length in pixels, or camera_angle_x in radians")
     return Frame(

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from crossgrad_core.plugin import UserError, open_file, size_text
 from crossgrad_plugins.readers._json import Fields
 
-#: Limits: bytes of a file, bytes of a tag or comment, nesting depth, elements and attributes.
+#: Limits: bytes of a file, bytes of a tag or a comment, nesting depth, and number of elements and
+#: attributes.
 LARGEST: Final = 128 << 20
 _LONGEST: Final = 4 << 20
 _DEEPEST: Final = 64

@@ -18,7 +18,8 @@ from crossgrad_plugins.readers._raw import find_points, raw_scene
 from crossgrad_plugins.readers._transforms import Posed, raw_views, read_frame
 from crossgrad_plugins.readers.colmap_files.folder import check_scene_folder
 
-#: The views of the first existing file are held out. Validation views are unused if test exists.
+#: The views of the first existing file are held out. Validation views are not used if the test file
+#: exists.
 _HELD_OUT: Final = ("transforms_test.json", "transforms_val.json")
 _BEHIND: Final = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "none": None}
 
@@ -51,7 +52,7 @@ class BlenderReader(Reader):
     def read(self, path: Path, options: SceneOptions) -> Scene:
         check_scene_folder(path)
         inside = Inside(path)
-        # The scene's own folder has no name within the scene.
+        # Inside the scene, the scene's own folder has no name.
         file = inside.name(_accepts.BLENDER_FILE, "reader.folder", self.folder)
         base = file[: -len(_accepts.BLENDER_FILE)]
         train = _read(inside, file, base)

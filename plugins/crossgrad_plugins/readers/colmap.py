@@ -28,7 +28,8 @@ from crossgrad_plugins.readers.place.place import by_code, by_file, by_gps
 
 #: Name of the file with the georeference, in the model's folder or in the scene's folder.
 _GEOREF = "georef.json"
-#: Below this length, or above its inverse, the square of a quaternion's length is not accurate.
+#: If a quaternion's length is below this value, or above its inverse, the square of the length is
+#: not accurate.
 _SHORTEST = 1e-100
 
 
@@ -173,7 +174,7 @@ def _find_rows(
     """Return the rows of the points with these ids, without ids unknown to the model."""
     if not len(ids):
         return np.zeros(0, dtype=np.int64)
-    # searchsorted is many times faster with sorted queries.
+    # Sort the queries, because searchsorted is then many times faster.
     points = np.sort(points)
     positions = np.minimum(np.searchsorted(ids, points), len(ids) - 1)
     return np.asarray(order[positions[ids[positions] == points]], dtype=np.int64)

@@ -40,7 +40,8 @@ from crossgrad_plugins.readers.colmap_files.folder import check_scene_folder
 from crossgrad_plugins.readers.place.place import at, by_gps
 
 _TERMS: Final = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
-#: The field for rolling shutter compensation, and its values that mean no compensation.
+#: The field for rolling shutter compensation, and the values of the field that mean no
+#: compensation.
 _ROLLING: Final = "rolling_shutter"
 _OFF: Final = frozenset({"false", "0", "no", "off", "none", "disabled"})
 _GLOBAL: Final = (
@@ -250,7 +251,7 @@ def _sensor(element: Element, file: Path, place: str) -> Calibration:
     if _is_rolling(element):
         what = f"a camera with a rolling shutter ({element.get('label') or 'without a label'})"
         raise refuse_lens(what, fields.where("rolling_shutter"), _GLOBAL)
-    # In the XML, an adjusted calibration follows the initial calibration.
+    # In the XML file, an adjusted calibration follows the initial calibration.
     calibrations = element.findall("calibration")
     adjusted = [
         calibration for calibration in calibrations if calibration.get("class") == "adjusted"

@@ -27,7 +27,8 @@ from crossgrad_plugins.readers._transforms import (
 from crossgrad_plugins.readers.colmap_files.folder import check_scene_folder
 from crossgrad_plugins.readers.place.place import by_gps
 
-#: The lists of training views and held-out views. The first held-out list with views is used.
+#: The lists of training views and held-out views. Of the held-out lists, the first list that
+#: contains views is used.
 _TRAIN, *_HELD_OUT = "train_filenames", "test_filenames", "val_filenames"
 
 

@@ -34,7 +34,8 @@ from crossgrad_plugins.readers.colmap_files.folder import check_scene_folder
 from crossgrad_plugins.readers.place.place import at, by_gps, origin_of
 
 _BYTE: Final = 255
-#: Smallest divisor for a rotation angle in radians. Below it, the sine equals the angle.
+#: Smallest divisor for a rotation angle in radians. If the angle is smaller, its sine is equal to
+#: the angle.
 _SMALL: Final = 1e-12
 
 
@@ -122,7 +123,7 @@ def _place(chosen: Fields) -> OnEarth | None:
         return None
     shots = [shot for shot in chosen.members("shots").values() if "gps_position" in shot]
     off = [_center(shot) - shot.numbers("gps_position", 3) for shot in shots]
-    # By default OpenSfM does not read altitudes from photos, so compare only x and y.
+    # Compare only x and y, because OpenSfM does not read altitudes from photos by default.
     level = np.array(off).reshape(-1, 3)[:, :2]
     rms = {"rms_horizontal": float(np.sqrt((level**2).sum(axis=1).mean()))} if off else {}
     return OnEarth(origin, SAME, f"reference_lla of {chosen.file.name}", rms)

@@ -14,46 +14,47 @@ BETA1, BETA2 = 0.9, 0.999
 DENSIFIER, SHORT_DENSIFIER = "adc", "absgrad"
 RESOLUTION, SHORT_RESOLUTION = "full", "strided"
 INITIALIZER, POINTS_ONLY, EXPOSURE = "fill-gaps", "points", "auto"
-#: A short run with at least this many training photos densifies by absolute gradients. With fewer
-#: photos it overfits.
+#: A short run with at least this many training photos uses densification by absolute gradients.
+#: With fewer photos, such a run overfits.
 MANY_PHOTOS: Final = 100
 
-#: The published rates are for `REFERENCE` steps. A shorter run multiplies them by the ratio
-#: `REFERENCE` / steps to this power. The power is below 1: the sum of the rates falls with the
-#: length, but not as fast.
+#: The published learning rates are for `REFERENCE` steps. A shorter run multiplies them by the
+#: ratio `REFERENCE` / steps to this power. The power is below 1, so a shorter run still has a
+#: smaller sum of learning rates.
 SHORTNESS: Final = 0.45
-#: Largest factor, which runs of about 1,000 steps use.
+#: Largest factor of the learning rates. Runs of about 1,000 steps use it.
 MOST: Final = 4.5
-#: A run has few passes if it renders each training photo fewer times than this, on average. Such a
-#: run ends long before it overfits.
+#: A run has few passes if it renders each training photo fewer times than this, on average. A run
+#: with few passes ends long before it overfits.
 FEW_PASSES: Final = 40
-#: Power and largest factor of the learning rates in runs with few passes.
+#: Power and largest factor of the learning rates for runs with few passes.
 FEW_PASSES_SHORTNESS, FEW_PASSES_MOST = 0.65, 6.3
 #: In a run with few passes, Adam's second moment averages over this share of the steps, but over at
 #: least `LEAST_MEMORY` steps. The first gradients are much larger than later gradients. The
-#: published average would remember them and slow down the next 1,000 steps.
+#: published average would contain these large gradients for 1,000 steps and slow down training.
 MEMORY, LEAST_MEMORY = 1 / 50, 50
-#: Decay of the first moment in short runs: it averages over 3 steps instead of 10.
+#: Decay of the first moment in short runs. With this value, the first moment averages over 3 steps
+#: instead of 10.
 SHORT_BETA1: Final = 0.7
-#: Largest standard deviation of a Gaussian, as a share of the distance to the nearest camera that
-#: has the Gaussian outside its photo.
+#: Maximum standard deviation of a Gaussian, as a share of a distance. The distance is measured to
+#: the nearest camera whose photo does not contain the Gaussian.
 SCALE_RATIO: Final = 0.5
-#: Share of a short run with few passes before SH bands above the first are rendered. Earlier, these
-#: bands cost time and improve little.
+#: SH bands above the first are rendered only after this share of a short run with few passes.
+#: Before that, these bands cost time and improve little.
 SH_START: Final = 0.5
 #: Highest SH degree.
 MOST_DEGREES: Final = 3
-#: Share of the run, at its end, in which constant learning rates decay.
+#: Constant learning rates decay in this last share of the run.
 LR_TAIL: Final = 0.25
-#: Share of the Gaussians that a view omits, if the median point is seen by at most `FEW_PHOTOS`
-#: photos.
+#: Share of the Gaussians that are left out of a render. It is used if at most `FEW_PHOTOS` photos
+#: see the median point.
 DROPOUT, FEW_PHOTOS = 0.3, 5
-#: Minimum number of edits of budgeted growth, in runs of at least this many views. In shorter runs,
-#: new Gaussians have no time to converge and can cost 1 dB.
+#: Minimum number of edits of budgeted growth. It applies to runs of at least this many views. In
+#: shorter runs, new Gaussians have no time to converge and can cost 1 dB.
 EDITS, SHORTEST_RUN_WITH_EDITS = 6, 600
-#: Reason that the table shows while only the duration of the run in seconds is known.
+#: Reason that the table shows as long as only the duration of the run is known.
 UNKNOWN: Final = "decided when the length is planned"
-#: Page that shows how these values were measured.
+#: Documentation page that shows how these values were measured.
 SCHEDULES: Final = "docs/schedules.md"
 
 
@@ -125,7 +126,7 @@ class Choice:
         given: Literal["unbounded", "budget"] | None = self.given.get("growth")
         if given is not None:
             return given
-        # A limit that the user sets is not a target.
+        # If the user sets `max_gaussians`, growth does not use it as a target.
         named = self.given["max_gaussians"] not in {None, "auto"}
         led = budgeted and self.facts.unit == "views"
         return "budget" if led and not named else "unbounded"
@@ -332,7 +333,8 @@ def _beta2(choice: Choice) -> float:
         return BETA2
     memory = max(LEAST_MEMORY, MEMORY * facts.steps)
     if facts.batched:
-        # With K views per step, Adam averages over 1/K of the steps.
+        # With K views per step, a run has 1/K as many steps, and Adam averages over 1/K as many
+        # steps.
         memory *= facts.views / facts.steps
     return min(BETA2, 1.0 - 1.0 / memory)
 

@@ -5,20 +5,22 @@ from typing import Final
 
 from crossgrad_core.plugin import REFERENCE, shortness
 
-#: The budget of runs of `SHORT_LENGTH` views. In longer runs the budget first grows with this power
-#: of the length: to 100,000 primitives at 10,000 views. Source: measured by metal-gauss.
+#: Runs of `SHORT_LENGTH` views have the budget `SHORT_BUDGET`. In longer runs, the budget first
+#: grows with this power of the length, for example to 100,000 primitives at 10,000 views. Source:
+#: measured by metal-gauss.
 SHORT_BUDGET, SHORT_LENGTH, POWER = 30_000, 1_000, log(100 / 30) / log(10)
-#: A run that begins with few Gaussians may multiply their number by `GROWN`, and may always reach
-#: `LEAST_BUDGET`, because a short run has no time to place more (docs/schedules.md).
+#: A run that begins with few Gaussians may multiply their number by `GROWN`. It may also always
+#: reach `LEAST_BUDGET`. The budget is not larger, because a short run has no time to place more
+#: Gaussians (docs/schedules.md).
 GROWN, LEAST_BUDGET = 2, 10_000
-#: Pixels of the photos with which the budget was measured (400 x 300), and the power with which the
-#: budget grows for larger photos, because they show more detail. Measured by us
+#: Number of pixels of the photos with which the budget was measured (400 x 300). The budget grows
+#: with this power of the number of pixels, because larger photos show more detail. Measured by us
 #: (docs/schedules.md).
 PIXELS, FINER = 120_000, 0.4
-#: The additional power in runs with few passes, which cannot overfit, and the pixels of the largest
-#: photos (800 x 600) for which this power was measured.
+#: Additional power of the number of pixels in runs with few passes, which cannot overfit. It was
+#: measured for photos of up to this number of pixels (800 x 600).
 FEW_PASSES_FINER, FEW_PASSES_PIXELS = 0.5, 480_000
-#: The published length has no budget. When the length approaches it, the budget is raised by at
+#: The published length has no budget. For lengths just below it, the budget is multiplied by at
 #: most this factor.
 OPENED: Final = 10.0
 

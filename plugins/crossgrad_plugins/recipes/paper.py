@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Final
 
 from crossgrad_plugins.recipes.auto import Auto
 
-#: Settings that all arms share.
+#: Settings that all arms of the experiment share.
 BASE: Final[Mapping[str, Any]] = {
     "max_views": 1200,
     "data.max_size": 400,

@@ -10,7 +10,7 @@ from crossgrad_core.plugin import Decision, Facts, Recipe, Unit
 #: Near plane of the original code, in units of the scene's original frame.
 NEAR: Final = 0.2
 BECAUSE: Final = "as published"
-#: Settings that do not depend on any fact.
+#: Settings that are the same for all runs.
 VALUES: Final[Mapping[str, Any]] = {
     "initializer": "points",
     "exposure": "none",

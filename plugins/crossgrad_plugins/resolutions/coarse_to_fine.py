@@ -21,10 +21,11 @@ from crossgrad_core.plugin import (
     Schedule,
 )
 
-#: A scale of at least this value is replaced by full size, because it would save hardly any pixels.
+#: If a scale is at least this value, full size is used instead, because the scale would save hardly
+#: any pixels.
 FULL_FROM = 0.95
 _REACHED = "reached"
-#: If density control lasts longer, the window ends at this share of the run.
+#: If density control lasts longer than this share of the run, the window ends at this share.
 LATEST = 0.9
 #: Without density control, the window ends at this share of the run.
 USUAL = 0.5

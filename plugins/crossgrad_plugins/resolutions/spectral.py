@@ -17,19 +17,21 @@ from crossgrad_plugins.resolutions.coarse_to_fine import CoarseToFine, Course, P
 
 #: Maximum number of photos whose spectrum is measured, over all regimes together.
 MOST_PHOTOS = 32
-#: Regimes get separate courses if the shares of the spectrum that a scale keeps differ by more than
-#: this.
+#: Regimes get separate scale courses if their shares of the spectrum that a scale keeps differ by
+#: more than this.
 ALIKE = 0.05
-#: Name of the course of all photos.
+#: Name of the scale course that applies to all photos.
 ALL = "all"
-#: Number of scales, 1 / GRID to 1, at which the shares are measured.
+#: Number of scales, from 1 / GRID to 1, at which the kept shares of the spectrum are measured.
 GRID = 256
-#: Largest side of the window in the middle of a photo that is analysed, in pixels. A scale keeps
-#: the same share of the spectrum in a crop as in the photo, but not in a smaller copy.
+#: Largest side in pixels of the window in the middle of a photo that is analysed. In a cropped
+#: photo, a scale keeps the same share of the spectrum as in the whole photo. In a smaller copy of
+#: the photo, the scale keeps another share.
 _WINDOW = 1024
-#: Number of photos that are decoded at once; more would need too much memory.
+#: Number of photos that are decoded at once. More photos would need too much memory.
 _AT_ONCE = 2
-#: Tolerance, because a frequency that a scale just keeps may have been rounded up.
+#: Tolerance for a frequency that a scale just keeps, because the frequency may have been rounded
+#: up.
 _ROUNDING = 1e-9
 Floats = NDArray[np.float64]
 
@@ -124,7 +126,7 @@ class Spectral(CoarseToFine):
         levels = np.unique(np.linspace(first, GRID, self.levels + 1).round().astype(int))
         ends, pixels = group.kept[levels], scales[levels] ** 2
         parts = np.arange(self.levels) / self.levels
-        # This is the level that the run leaves next.
+        # `ahead` is the level that the run leaves next.
         ahead = np.searchsorted(ends, parts, side="right")
         behind = np.maximum(ahead - 1, 0)
         # Before the first level is left, there is no level to interpolate from.
@@ -212,8 +214,9 @@ def amplitudes_within(grey: Floats) -> Floats:
     """
     height, width = grey.shape
     amplitudes = np.abs(np.fft.rfft2(grey))
-    # For a real image, the other half of the columns is equal. Exceptions are the first column and,
-    # if their number is even, the last column.
+    # For a real image, the other half of the spectrum has equal amplitudes, so double these
+    # columns. Exceptions are the first column and, if the number of columns is even, the last
+    # column.
     amplitudes[:, 1 : (width + 1) // 2] *= 2.0
     cells = np.maximum.outer(_cells(np.fft.fftfreq(height)), _cells(np.fft.rfftfreq(width)))
     return np.cumsum(np.bincount(cells.ravel(), amplitudes.ravel(), GRID + 1))

@@ -10,9 +10,11 @@ from typing_extensions import override
 from crossgrad_core.plugin import Camera, Field, Scene, Schedule, listed, shortness
 from crossgrad_plugins.resolutions.coarse_to_fine import CoarseToFine, Course, Part
 
-#: Share of a short run in which one pixel of each 2 x 2 is rendered; smaller for longer runs.
+#: Share of a short run in which only a part of the pixels is rendered, at most one pixel of each 2
+#: x 2. In longer runs, the share is smaller.
 _SHARE = 0.8
-#: Shares of this window in which one pixel of each 8 x 8, and of each 4 x 4, is rendered.
+#: Shares of this window. Until the first share, one pixel of each 8 x 8 is rendered. Until the
+#: second share, one pixel of each 4 x 4 is rendered.
 _EIGHTH, _QUARTER = 0.3, 0.6
 
 
@@ -42,7 +44,7 @@ class Strided(CoarseToFine):
     @override
     def fitted_to(self, scene: Scene) -> "Strided":
         most = [self._most(view.camera) for view in scene.train_views]
-        # An n that the user sets is used for the photos that are large enough for it.
+        # If the user sets n, it is used for all photos that are large enough for it.
         n = median(most) if self.coarsest is None else min(self.coarsest, max(most))
         return self.model_copy(
             update={"coarsest": max(stride for stride in (1, 2, 4, 8) if stride <= n)}
@@ -50,7 +52,8 @@ class Strided(CoarseToFine):
 
     @override
     def measured(self, scene: Scene) -> CoarseToFine:
-        # This function is called in each step, so do not examine all photos again.
+        # Use the stored value. This function is called in each step, and examining all photos again
+        # would take too long.
         return self if self.coarsest is not None else self.fitted_to(scene)
 
     @override

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from crossgrad_core.plugin import Field, GaussiansContext, GaussiansResult, Rule, hookimpl
 
-#: The name of the rule and of its random generator.
+#: Name of the rule and of its random generator.
 NAME: Final = "dropout"
 
 
@@ -31,8 +31,8 @@ class Dropout(Rule):
         gaussians = context.gaussians
         draws = _draws(context.rngs[NAME], len(gaussians), gaussians.opacities.device)
         raised = gaussians.opacities * ((draws >= self.share) / (1.0 - self.share))
-        # Clamp the value to 1 but keep its gradient; otherwise a nearly opaque Gaussian could never
-        # fade.
+        # Clamp the value to 1 but keep its gradient. Without the gradient, a nearly opaque Gaussian
+        # could never fade.
         opacities = raised - (raised.detach() - 1.0).clamp(min=0.0)
         return GaussiansResult(replace(gaussians, opacities=opacities))
 

@@ -26,10 +26,10 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: Percentile of the depths of a camera's SfM points that is used as the nearest depth, because
-#: single points are often wrong.
+#: The nearest depth of a camera is this percentile of the depths of its SfM points. The minimum is
+#: not used, because single points are often wrong.
 NEAREST: Final = 1.0
-#: A camera that observes fewer points than this does not show which space is empty.
+#: A camera that observes fewer points than this gives no reliable information about empty space.
 FEWEST_SEEN: Final = 8
 
 
@@ -40,8 +40,8 @@ class Floaters(Rule):
         0.3,
         gt=0,
         le=1,
-        # The ground below a level camera is farther away, because the camera sees the ground only
-        # at a distance.
+        # The nearest observed point of a level camera is farther away than the ground below it,
+        # because the camera sees the ground only at a distance.
         description="depth range that counts as empty, as a share of the distance from a camera "
         "to the nearest point that it observes",
     )
@@ -97,8 +97,8 @@ def floaters(model: Model, empty: float) -> Tensor:
     for view in model.scene.train_views:
         if len(rows) == 0:
             break
-        # Render only the candidates: this takes little time, and Gaussians that hide them do not
-        # matter.
+        # Render only the candidates, because this takes little time. Other Gaussians that hide the
+        # candidates do not matter.
         alone = apply_to_parameters(Edit(rows), backbone.blocks(), parameters)
         with torch.no_grad():
             gaussians = backbone.decode(alone, view.camera, model.phase)

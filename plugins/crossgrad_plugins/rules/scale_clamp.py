@@ -28,7 +28,7 @@ from crossgrad_core.plugin import (
     is_in_image,
 )
 
-#: Steps between two checks of the sizes.
+#: Number of steps between two checks of the sizes.
 EVERY: Final = 50
 #: Gaussians with a smaller size, in scene extents, are not checked. Most Gaussians are smaller, and
 #: hardly any of them exceeds the bound.
@@ -59,7 +59,7 @@ class ScaleClamp(Rule):
         rows = rows[_may_be_near(scene, positions[rows], torch.exp(largest[rows]) / ratio)]
         distances = _nearest_beside(scene, positions[rows].double().cpu().numpy())
         most = torch.from_numpy(np.log(np.maximum(ratio * distances, LEAST))).to(scales)
-        # Values that are not finite are left alone; the finiteness check reports them.
+        # Leave out values that are not finite, because the finiteness check reports them.
         above = (largest[rows] > most) & largest[rows].isfinite()
         rows, most = rows[above], most[above]
         if not len(rows):

@@ -22,7 +22,7 @@ _COUNT: Final = "count"
 #: Maximum number of states in an average. Neighbouring states hardly differ, and a sum of 100
 #: float32 numbers has a rounding error of about one millionth.
 SAMPLES: Final = 100
-#: Decimals of a number of steps that are kept; the rest is a rounding error.
+#: Number of decimals of a step number that are kept. Further decimals are rounding errors.
 _DIGITS: Final = 6
 
 
@@ -44,9 +44,11 @@ class WeightAveraging(Rule):
         The sums start again if the set of primitives changed or if values were overwritten.
         """
         held, total = context.state(NAME), context.schedule.total
-        # A tenth of ten steps is one step, but not in binary floating point.
+        # Round before the conversion. A tenth of ten steps is one step, but binary floating point
+        # gives another value.
         before = int(round((1.0 - self.share) * total, _DIGITS))
-        left_out = context.step <= before  # The run may have been extended.
+        # If the run was extended, this drops the earlier average.
+        left_out = context.step <= before
         state = EMPTY_STATE if context.edited or left_out else held
         if not left_out and (total - context.step) % -(-(total - before) // SAMPLES) == 0:
             state = _added(state, context.backbone.trained_blocks(), context.parameters)

@@ -98,7 +98,7 @@ class Active(Sampler):
         if fresh or str(first) not in losses:
             return _uniform(fresh or others, rng)
         scores = np.abs(np.array([losses[str(view)] for view in others]) - losses[str(first)])
-        # A stable sort keeps the order of the views for equal scores.
+        # Use a stable sort, so that views with equal scores keep their order.
         best = np.argsort(-scores, kind="stable")[: self.top]
         temperature = max(float(scores[best].std()), _SMALLEST_TEMPERATURE)
         logits = (scores[best] - scores[best].max()) / temperature

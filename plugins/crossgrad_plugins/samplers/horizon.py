@@ -17,7 +17,7 @@ from crossgrad_core.plugin import (
 )
 from crossgrad_plugins.samplers.draws import EpochOrder, draw, drawn, groups_of
 
-#: Decimals of a number of steps that are kept; the rest is a rounding error.
+#: Number of decimals of a step number that are kept. Further decimals are rounding errors.
 _DIGITS = 6
 
 
@@ -60,7 +60,8 @@ class Horizon(Sampler):
     @override
     def sample(self, context: SampleContext, state: PluginState) -> tuple[ViewSample, PluginState]:
         near, far = groups_of(context, "horizon", 2).items()
-        # 0.29 of 100 steps are 29 steps, but not in binary floating point.
+        # Round the product. 0.29 of 100 steps are 29 steps, but binary floating point gives another
+        # value.
         coarse = context.step <= round(self.coarse_share * context.schedule.total, _DIGITS)
         far_turns, near_turns = self.coarse if coarse else self.fine
         turns = [far] * far_turns + [near] * near_turns

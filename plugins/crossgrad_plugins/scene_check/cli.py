@@ -33,4 +33,4 @@ def check(
     from crossgrad_plugins.scene_check import app
 
     for line in app.lines_of(scene, assignments or []):
-        print(line)  # noqa: T201 - the result of the command
+        print(line)  # noqa: T201 - print the result of the command

@@ -115,7 +115,7 @@ class Sweep:
         self.layout = Layout((request.out or SWEEPS / (grid.name or request.path.stem)).absolute())
         if (
             not read_only
-        ):  # Check before planning, which takes time; the lock itself is taken later.
+        ):  # Check before planning, because planning takes time. The lock itself is taken later.
             _refuse_a_second(self.layout.out)
             _refuse_what_is_no_sweep(self.layout)
         self.plan = planned(grid, request.path, request.assignments)
@@ -307,4 +307,4 @@ def _note(line: str) -> None:
 
 def _say(lines: Iterable[str]) -> None:
     for line in lines:
-        print(one_line(line))  # noqa: T201 - the result of the command
+        print(one_line(line))  # noqa: T201 - print the result of the command

@@ -20,15 +20,16 @@ _PAUSE = 1.0
 _GIB = 2**30
 #: Seconds between two polls of a process.
 PAUSE = 0.1
-#: The command that trains a run; core numbers and the arguments of `crossgrad` follow.
+#: The command that trains a run. The numbers of the cores and the arguments of `crossgrad` are
+#: appended.
 COMMAND = (sys.executable, "-m", "crossgrad_plugins.sweep.child")
 #: Environment variables that limit the threads of libraries.
 _THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 #: Exit status of a run that was refused.
 _REFUSED = 2
-#: Maximum number of output lines that are kept as the reason of a failure.
+#: Maximum number of output lines that are kept to explain a failure.
 _MOST_LINES = 12
-#: Number of deaths without a new checkpoint after which a run has failed.
+#: A run has failed if its process died this many times without a new checkpoint.
 MOST: Final = 3
 #: Seconds between two checks of a folder that another process writes into.
 _WAIT = 1.0
@@ -191,7 +192,8 @@ class Attempt:
             stderr=subprocess.STDOUT,
             cwd=worker.folder,
             env={**os.environ, **dict.fromkeys(_THREADS, str(worker.threads))},
-            # Ctrl-C in the terminal is meant for the sweep, which then stops its runs.
+            # Start a new session, because Ctrl-C in the terminal is meant for the sweep. The sweep
+            # then stops its runs.
             start_new_session=True,
         )
 
@@ -217,7 +219,8 @@ class Attempt:
     def _reason(self, folder: Path, code: int) -> str:
         """Return why the run failed: the run's own error, or the last output of its process."""
         error = (summary_of(folder) or {}).get("error")
-        # A refused run writes no summary, so an existing summary may be from an earlier attempt.
+        # If the run was refused, ignore an existing summary. A refused run writes no summary, so
+        # the file may be from an earlier attempt.
         if isinstance(error, str) and code != _REFUSED:
             return error
         with self._layout.output(self.job.id).open("rb") as output:

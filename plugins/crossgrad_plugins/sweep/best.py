@@ -11,12 +11,12 @@ from crossgrad_plugins.sweep.grid import Arm, Choice, Grid, Settings, choices, s
 from crossgrad_plugins.sweep.job import Job
 from crossgrad_plugins.sweep.run_status import Standing, figure
 
-#: Settings of the length; a run uses one of them.
+#: Settings that determine the length. A run uses one of them.
 LENGTHS = frozenset({"steps", "max_views", "seconds"})
 #: Number of seeds in the new grid.
 SEEDS = 3
-#: Configuration and scene -> seed -> the metric. The metric is None if the run failed or lacks it;
-#: a run that has not ended is absent.
+#: Configuration and scene -> seed -> the metric. The metric is None if the run failed or did not
+#: compute it. A run that has not ended is not in the mapping.
 Ends: TypeAlias = Mapping[tuple[str, str], Mapping[int, float | None]]
 
 
@@ -54,11 +54,11 @@ def best_grid(
     for arm in grid.arms:
         arm_choices = [choice for choice in choices(grid) if choice.arm.name == arm.name]
         if len(arm_choices) == 1:
-            # Nothing varies in this arm, so it is the reference for the other arms.
+            # Only one configuration exists in this arm, so it is the reference for the other arms.
             for scene in map(scene_name, grid.scenes):
                 _check_ended([(arm_choices[0], ends[arm_choices[0].label, scene])], scene, grid)
-            # Write them as parameters, because parameters can override settings and settings
-            # cannot.
+            # Write the values as parameters, because parameters can override settings, but settings
+            # cannot override settings.
             fixed = {name: {"values": [value]} for name, value in arm_choices[0].parameters.items()}
             as_it_is = {"name": arm.name, "settings": arm.settings, "by_scene": arm.by_scene}
             arms.append({**as_it_is, **({"parameters": fixed} if fixed else {})})

@@ -15,9 +15,10 @@ from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 
-#: Standard input; nothing is ever written to it.
+#: File descriptor of standard input. Nothing is ever written to it.
 _PIPE = 0
-#: Linux first shares processors among sessions; a process's `nice` only counts within its session.
+#: Linux first divides processors among sessions. The `nice` value of a process counts only within
+#: its session.
 _SESSION_NICENESS = Path("/proc/self/autogroup")
 
 
@@ -35,7 +36,8 @@ def main() -> None:
 def _be_as_nice_as_asked() -> None:
     """Give the session of this run the niceness of its process."""
     if (niceness := getattr(os, "nice", lambda _: 0)(0)) > 0:
-        with suppress(OSError):  # The system is not Linux, or a Linux without session scheduling.
+        # This fails if the system is not Linux, or if it has no session scheduling.
+        with suppress(OSError):
             _SESSION_NICENESS.write_text(str(niceness), encoding="ascii")
 
 

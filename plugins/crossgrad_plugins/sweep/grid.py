@@ -24,8 +24,8 @@ Settings: TypeAlias = dict[str, Any]
 T = TypeVar("T")
 
 _TODO = "docs/sweep.md shows the format"
-#: Maximum number of runs; all runs are planned before the first starts, and a short grid can
-#: describe very many.
+#: Maximum number of runs. All runs are planned before the first run starts, and a short grid file
+#: can describe very many runs.
 MOST_RUNS = 100_000
 #: Settings that the sweep itself controls -> explanation.
 _RESERVED = {
@@ -33,7 +33,7 @@ _RESERVED = {
     "stop_after": "a sweep runs every run to its end",
     "threads": "use --threads, which applies to all runs",
 }
-#: Settings that have an option of the sweep.
+#: Settings for which the sweep has its own option.
 _OPTIONS = {"scene": "--scene SCENE", "seed": "--seed N"}
 _SHAPE = "must be `values: [...]`, `value: ...` or `parameters: {...}`"
 #: Error type of pydantic -> message in the terms of YAML instead of Python.

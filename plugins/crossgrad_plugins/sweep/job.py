@@ -50,7 +50,8 @@ def run_id(resolved: Mapping[str, Any], fingerprint: str) -> str:
     """
     kept = {name: value for name, value in resolved.items() if name not in _OF_NO_CONSEQUENCE}
     if kept.get("seconds") is not None:
-        kept.pop("steps", None)  # The seconds determine the steps.
+        # Leave out the number of steps, because the time limit determines it.
+        kept.pop("steps", None)
     text = json.dumps([kept, fingerprint], sort_keys=True, default=str)
     return sha256(text.encode()).hexdigest()[:_DIGITS]
 

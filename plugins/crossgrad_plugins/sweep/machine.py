@@ -14,7 +14,8 @@ _GIB = 2**30
 LEAST = 3 * _GIB // 2
 #: Maximum share of the available memory for runs.
 SHARE = 0.9
-#: The file in which Linux counts the ticks of each core, and the measuring time in seconds.
+#: The file in which Linux counts the ticks of each core, and the number of seconds between two
+#: readings.
 _COUNTS, _LOOK = Path("/proc/stat"), 0.25
 #: The fields of /proc/stat that count idle time and I/O wait.
 _IDLE = slice(3, 5)
@@ -69,7 +70,8 @@ def divided(workers: int | None, threads: int, memory: float | None) -> Machine:
 
 def idle_first(cores: Sequence[int]) -> tuple[int, ...]:
     """Return the cores with idle cores first, because another sweep may use some of the cores."""
-    with suppress(OSError, ValueError):  # The system is not Linux, or the file has another format.
+    # This fails if the system is not Linux, or if the file has another format.
+    with suppress(OSError, ValueError):
         before = _counts()
         time.sleep(_LOOK)
         after = _counts()

@@ -16,7 +16,8 @@ from crossgrad_plugins.sweep.run_status import Record, Standing, newest_row, rea
 #: Seconds between two reads of the records, and maximum number of failures in the live table.
 PAUSE: Final = 1.0
 MOST_FAILURES: Final = 8
-#: Default seconds of a run in addition to training: libraries, scene, results.
+#: Default number of seconds that a run needs in addition to training: for libraries, the scene and
+#: results.
 BESIDES = 12.0
 
 
@@ -59,7 +60,8 @@ class Watch:
 
     def look(self) -> list[Record]:
         """Read new records; return the records of runs that ended since the previous call."""
-        # The clocks of machines differ, so a new record may have an earlier time.
+        # Compare with known records instead of times. The clocks of machines differ, so a new
+        # record may have an earlier time.
         unread = [entry for entry in read_records(self.layout.records) if entry not in self._known]
         self._known.update(unread)
         new = [entry for entry in unread if entry.run in self._jobs]

@@ -196,7 +196,8 @@ class AnchorDensifier(Densifier):
     def densify(self, context: DensifyContext, state: PluginState) -> tuple[Edit, PluginState]:
         if not context.schedule.collects(context.step):
             return NO_EDIT, PluginState()
-        # The published schedule collects statistics from step 500 on and edits from step 1500 on.
+        # In the published schedule, statistics are collected from step 500 on and edits begin at
+        # step 1500.
         if context.schedule.counted(context.step) > context.schedule.densify_from // 3:
             state = observed(context, state)
         if not (state.per_primitive and context.schedule.densifies(context.step)):

@@ -17,10 +17,10 @@ from crossgrad_core.numerics.simd import (
     where,
 )
 
-#: Rows of one job; fixed, so that results do not depend on the number of threads.
+#: Number of rows of one job. It is fixed, so that results do not depend on the number of threads.
 _ROWS = 1 << 13
 _ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
-#: Squares below this value have lost precision.
+#: Squares below this value have too few significant bits.
 _SMALLEST = np.float32(1e-30)
 
 _Floats = NDArray[np.float32]
@@ -45,7 +45,8 @@ def _stretched(steps: _Three, factors: _Three, quats: _Four) -> _Three:
     r00, r01, r02 = one - (yy + zz), xy - wz, xz + wy
     r10, r11, r12 = xy + wz, one - (xx + zz), yz - wx
     r20, r21, r22 = xz - wy, yz + wx, one - (xx + yy)
-    # The order of these sums determines the last bits, and runs must be repeatable.
+    # Do not change the order of these sums, because it determines the last bits and runs must be
+    # repeatable.
     p = factors[0] * fma(r20, c, fma(r10, b, r00 * a))
     q = factors[1] * fma(r21, c, fma(r01, a, r11 * b))
     r = factors[2] * fma(r22, c, fma(r02, a, r12 * b))
@@ -60,7 +61,7 @@ def _stretched(steps: _Three, factors: _Three, quats: _Four) -> _Three:
 def _move_chunks(
     jobs: Jobs, positions: _Floats, steps: _Floats, factors: _Floats, quats: _Floats
 ) -> None:
-    # Buffers for the last rows of a job.
+    # Buffers for the last rows of a job, which do not fill a vector.
     position, step = np.zeros((LANES, 3), np.float32), np.zeros((LANES, 3), np.float32)
     factor, quat = np.zeros((LANES, 3), np.float32), np.zeros((LANES, 4), np.float32)
     rows = len(positions)

@@ -12,8 +12,9 @@ from crossgrad_core.numerics.jit import kernel
 from crossgrad_core.numerics.jobs import Jobs, next_job, parallel, serial
 from crossgrad_core.training.adam.coefficients import LARGEST, SMALLEST_NORMAL, TINY, Coefficients
 
-_CHUNK = 1 << 16  # elements; fixed, so that the split does not depend on the number of threads
-_RUN = 1 << 13  # elements that are skipped together if nothing has moved them yet
+# In elements. The size is fixed, so that the split does not depend on the number of threads
+_CHUNK = 1 << 16
+_RUN = 1 << 13  # Number of elements that are skipped together if no step has moved them yet
 
 _ZERO = np.float32(0)
 _TINY, _SMALLEST_NORMAL, _LARGEST = (np.float32(v) for v in (TINY, SMALLEST_NORMAL, LARGEST))
@@ -33,7 +34,7 @@ def update(
     beta1, new1, beta2, new2, step_size, root_scale, eps, square_floor, scale = numbers
     for i in range(len(param)):
         g = scale * grad[i]
-        g = min(max(g, -_LARGEST), _LARGEST)  # In this order NaN is preserved.
+        g = min(max(g, -_LARGEST), _LARGEST)  # This order of the arguments preserves NaN.
         g = _ZERO if abs(g) < _TINY else g
         m = beta1 * exp_avg[i] + new1 * g
         m = _ZERO if abs(m) < _TINY else m
@@ -102,7 +103,8 @@ def _update_chunks(
 
 def numbers_of(step: Coefficients) -> Numbers:
     """Return the coefficients of a step as float32; learning rates beyond float32 are infinite."""
-    with np.errstate(over="ignore"):  # The check of the parameters reports the effect.
+    # Ignore the overflow here, because the check of the parameters reports its effect.
+    with np.errstate(over="ignore"):
         return (
             np.float32(step.beta1),
             np.float32(1 - step.beta1),

@@ -38,25 +38,26 @@ from crossgrad_core.training.adam.numba_kernels.fused import Numbers, moves, upd
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
 
-#: Columns of a table of steps: both betas, step size, scale of the root, eps, and the largest step
-#: size and the smallest scale of the root over this and all later steps.
+#: Columns of a table of steps: both betas, step size, scale of the root, eps, largest step size and
+#: smallest scale of the root. The last two columns are taken over this step and all later steps.
 BETA1, BETA2, STEP_SIZE, ROOT_SCALE, EPS, MOST, LEAST = range(7)
 NUMBERS = 7
 
-#: Rows of one task, and short rows that are gathered into contiguous memory for a step.
+#: Number of rows in one task, and number of short rows that are gathered into contiguous memory for
+#: a step.
 _ROWS = 1024
 _GATHERED = 128
-#: Elements that a step with all rows gathers at a time, in whole cache lines (sixteen rows of any
-#: width). With parameters and moments, they fit into the first-level cache.
+#: Number of elements that a step with all rows gathers at a time, in whole cache lines (sixteen
+#: rows of any width). With parameters and moments, they fit into the first-level cache.
 _AT_ONCE = 768
-#: Long rows that are updated together if they are consecutive.
+#: Number of long rows that are updated together if they are consecutive.
 _SIDE_BY_SIDE = 16
-#: Elements of a cache line, and rows that are prefetched.
+#: Number of elements in a cache line, and number of rows that are prefetched.
 _LINE, _AHEAD = 16, 6
-#: Steps between two checks of whether a parameter still moves.
+#: Number of steps between two checks of whether a parameter still changes.
 _LOOK = 32
 #: A step of less than half a unit in the last place (2^-25 or more) does not change a parameter.
-#: Half of this is reserved for the rounding of the estimate.
+#: Half of this limit is reserved for the rounding of the estimate.
 _STILL = np.float32(2.0**-26)
 # Second moments above this value stay normal numbers for `_LOOK` steps with beta2 >= 1/2.
 _STEADY = np.float32(2.0**-90)
@@ -145,7 +146,7 @@ def catch_up(
     count = done.size if whole else rows.size
     end = steps.size // NUMBERS
     left = width % LANES
-    # Buffer for the last elements of a row; the unused lanes are zero.
+    # Buffer for the last elements of a row. The unused lanes are zero.
     rest = np.zeros(3 * LANES, np.float32)
     tasks = (count + _ROWS - 1) // _ROWS
     task = next_job(jobs, tasks)
@@ -222,7 +223,8 @@ def _step_row(
     The gradient of the row is row `grad_row` of `grad` if the row was rendered, else zero.
     """
     at, begin, g = row * width, grad_row * width, splat_wide(_ZERO)
-    # The last sixteen elements overlap with earlier ones, so compute them before these are written.
+    # The last sixteen elements overlap with earlier elements. Compute the last sixteen elements
+    # before the earlier elements are overwritten.
     tail = at + width - WIDE
     if drawn:
         g = load_wide(grad, begin + width - WIDE)

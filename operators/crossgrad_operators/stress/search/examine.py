@@ -59,8 +59,8 @@ def _from_laws(subject: Subject, batch: Batch, outputs: Floats) -> list[float] |
     views = search_views(batch.views)
     scaled = results(subject.operator, replace(batch, rows=batch.rows * _SCALE), views) / _SCALE
     apart = np.linalg.norm(scaled - outputs, axis=1)
-    # At nearly singular Gramians the order may matter; the Gramians of usual gradients are far from
-    # singular.
+    # Test the order only here. If a Gramian is nearly singular, the order may matter. The Gramians
+    # of random gradients are far from singular.
     if batch.family == USUAL and batch.views == 2:  # noqa: PLR2004
         turned = Views(views.labels[::-1], views.ratios[::-1], views.seed)
         other = results(subject.operator, replace(batch, rows=batch.rows[:, ::-1]), turned)

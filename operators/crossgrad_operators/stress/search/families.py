@@ -15,17 +15,17 @@ from crossgrad_operators.stress.runner import context_of
 Rows = NDArray[np.float64]
 #: Function (generator, B, K, P) -> [B, K, P] gradients.
 Family = Callable[[np.random.Generator, int, int, int], Rows]
-#: Maximum number of views and of elements.
+#: Maximum number of views, and maximum number of elements.
 VIEWS, ELEMENTS = 20, 50
-#: Distribution for which the share of gradients outside a set is stated.
+#: Family of gradients for which the share outside a set is reported.
 USUAL: Final = "random"
 #: Numbers of views, and their probabilities. An exact answer takes 1 ms for two views and 1 s for
 #: 20 views.
 _VIEWS: Final = np.arange(2, VIEWS + 1)
 _SHARES: Final = _VIEWS**-2.0 / (_VIEWS**-2.0).sum()
-#: Number of cases in a batch, times K^2.
+#: Number of cases in a batch with K views, multiplied by K^2.
 _CASES: Final = 256
-#: The block whose rows are separate gradients.
+#: The block in which each row is a separate gradient.
 BLOCK = Block("means", ("means",), True, "geometry", LearningRate(1.0))
 
 
@@ -39,7 +39,7 @@ def cases_of(views: int) -> int:
 
 def rounded(rows: Rows, dtype: torch.dtype) -> Rows:
     """Return the rows rounded to a type of gradients, as float64 numbers."""
-    # Adding zero removes the sign of zeros.
+    # Add 0, so that no negative zeros remain.
     result: Rows = torch.from_numpy(rows).to(dtype).double().numpy() + 0.0
     return result
 
@@ -190,7 +190,7 @@ def _results(operator: Operator, rows: Rows, dtype: torch.dtype, views: Views) -
     try:
         combined = operator.aggregate(context, EMPTY_STATE)[0].gradients[BLOCK.name]
     except Exception:
-        # Third-party code may raise anything.
+        # Operators of other packages may raise any exception.
         return _halved(operator, rows, dtype, views)
     if combined is None:
         return np.full(rows[:, 0].shape, np.nan)

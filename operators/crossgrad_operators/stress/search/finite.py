@@ -15,7 +15,7 @@ from crossgrad_operators.stress.search.families import FAMILIES, VIEWS, Batch, r
 from crossgrad_operators.stress.search.samples import Sample
 from crossgrad_operators.stress.suite import Subject
 
-#: Types of gradients.
+#: Types of gradients that are tested.
 BOTH: Final = (torch.float32, torch.float64)
 #: Number of cases in a batch, and greatest number of elements.
 BATCH, ELEMENTS = 1000, 20
@@ -64,7 +64,8 @@ def run_finite(
 
 def _batch(subject: Subject, dtype: torch.dtype, count: int, seed: tuple[int, int]) -> Batch:
     rng = np.random.default_rng(seed)
-    # Two successive batches belong to the same family, one batch of each type.
+    # Two successive batches belong to the same family. The gradients of the two batches have
+    # different types.
     family = list(FAMILIES)[seed[1] // 2 % len(FAMILIES)]
     views = int(rng.integers(2, VIEWS + 1))
     if not subject.operator.views.admits(views):

@@ -27,7 +27,7 @@ from crossgrad_operators.stress.suite import Subject
 
 #: Number of cases in a round that are changed slightly. These cases need no exact arithmetic.
 JUMPS = 64
-#: A smaller case must keep at least this share of the value.
+#: A reduced case must keep at least this share of the value.
 KEPT = 0.7
 #: Numbers of significant digits to which elements are rounded.
 FEW_DIGITS = (1, 2, 4)
@@ -99,7 +99,7 @@ def fresh(extent: Extent, turn: int) -> Batch:
 def _round(subject: Subject, tally: WorstCases, batch: Batch, at: tuple[int, int]) -> None:
     admitted = subject.operator.views
     if not admitted.admits(batch.views):
-        # Operators that take only pairs receive pairs of the same kind.
+        # If an operator takes only pairs, give it the first two views of each case.
         batch = Batch(batch.rows[:, :2], batch.dtype, batch.family)
     if not admitted.admits(batch.views):
         return

@@ -30,7 +30,7 @@ def read_rows(text: str, dtype: torch.dtype) -> Case:
     with np.errstate(over="ignore"):
         case = short(str(dtype).removeprefix("torch."), rows, dtype)
         finite = np.isfinite(case.exact_head).all()
-    if not finite:  # This is the value after rounding to the type.
+    if not finite:  # The test comes after rounding to the type.
         raise _no_matrix(text)
     return case
 

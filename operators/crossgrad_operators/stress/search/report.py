@@ -7,7 +7,7 @@ from crossgrad_core.commands import write_table
 from crossgrad_operators.stress.search.samples import Sample
 from crossgrad_operators.stress.search.worst_cases import WorstCases
 
-#: Maximum share of usual gradients outside a set, and minimum number of gradients for this check.
+#: Maximum share of random gradients outside a set, and minimum number of gradients for this check.
 SHARE, ENOUGH = 0.01, 2000
 
 #: Counts that are columns of the CSV file.

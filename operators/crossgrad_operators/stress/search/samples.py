@@ -69,7 +69,7 @@ def mutants(rng: np.random.Generator, parents: Sequence[Sample], admitted: ViewC
         rows = reshaped if admitted.admits(len(reshaped)) else rows
     batch = np.repeat(rows[None], cases_of(len(rows)), axis=0)
     pieces = np.array_split(batch, len(MUTATIONS))
-    # The order is random because the last pieces of a small batch are empty.
+    # Use a random order, because the last pieces of a small batch are empty.
     order = rng.permutation(len(MUTATIONS)).tolist()
     variants = [
         MUTATIONS[mutation](rng, piece) for mutation, piece in zip(order, pieces, strict=True)
@@ -118,7 +118,7 @@ def _turn_rows(rng: np.random.Generator, rows: Rows) -> Rows:
     return np.asarray(np.take_along_axis(rows * signs, order[:, :, None], axis=1))
 
 
-#: Function (generator, [K, P]) -> rows with one row or column more or fewer.
+#: Function (generator, [K, P]) -> gradients with one row or one column more or fewer.
 Reshaping = Callable[[np.random.Generator, Rows], Rows]
 
 

@@ -11,9 +11,10 @@ from crossgrad_operators.stress.search.families import USUAL, Batch
 from crossgrad_operators.stress.search.samples import Sample
 from crossgrad_operators.stress.verdict import NOT_FINITE, Finding
 
-#: Number of stored cases, of either kind, from which mutants are made.
+#: Number of stored cases of each kind. Mutants are made from them.
 POOL = 8
-#: Maximum number of views of these cases, because exact answers take long for more views.
+#: Maximum number of views of the cases from which mutants are made. Exact answers take long for
+#: more views.
 MUTATED_VIEWS = 8
 #: Maximum change of a continuous method's result, as a share of the longest gradient.
 JUMP = 1e-3
@@ -102,7 +103,8 @@ class WorstCases:
         if found.value > JUMP:
             self.broken += 1
             moved = f"the result moves by {found.value:.3g} of the longest gradient"
-            # Insert at the front, because other failures are numerous and would fill the list.
+            # Insert the case at the front, because other failures are numerous and would fill the
+            # list.
             jump = (found, f"{moved} if the gradients move by 1e-12")
             self.failures = [jump, *self.failures][:KEPT]
 

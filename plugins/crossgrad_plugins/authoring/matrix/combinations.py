@@ -24,10 +24,10 @@ from crossgrad_core.plugin import Backbone, Operator, Rasterizer, Sampler
 
 SLOTS: Final = ("sampler", "operator", "backbone", "densifier", "rasterizer")
 FURTHER: Final = ("loss", "exposure", "initializer", "resolution", "grouping", "observer")
-#: Options that components need to have an effect within these few steps.
+#: Options that make a component have an effect within these few steps.
 NEEDED: Final[Mapping[tuple[str, str], Mapping[str, Any]]] = {
     ("operator", "chain"): {"links": [{"name": "symmetric"}, {"name": "mean"}]},
-    # Anchors are judged at the first edit, and small cells leave free cells nearby.
+    # With this option, anchors are judged at the first edit. Small cells leave free cells nearby.
     ("backbone", "scaffold"): {"voxel_size": 1e-5},
     ("densifier", "anchor"): {"success_threshold": 0, "coarsest": 1},
     ("densifier", "octree"): {"success_threshold": 0},
@@ -35,14 +35,14 @@ NEEDED: Final[Mapping[tuple[str, str], Mapping[str, Any]]] = {
     ("densifier", "multiview"): {"importance": 0},
     ("densifier", "multiview-gate"): {"importance": 0},
 }
-#: Steps of a run of the matrix: density control edits in steps 2 and 4, and resets opacities in
-#: step 4.
+#: Number of steps in a run of the matrix. Density control edits in steps 2 and 4, and opacities are
+#: reset in step 4.
 STEPS: Final = 5
 _WINDOW: Final = {"densify_from": 1, "densify_every": 2, "densify_until": 100}
 _TIMES: Final = {"schedule_unit": "steps", "reset_every": 4, **_WINDOW}
-#: One value for each factor.
+#: A row contains one value for each factor.
 Row: TypeAlias = tuple[str, ...]
-#: Row -> reasons for its refusal; rows that work are absent.
+#: Row -> reasons why it was refused. Rows that work are not in the mapping.
 Refused: TypeAlias = Mapping[Row, Collection[str]]
 
 

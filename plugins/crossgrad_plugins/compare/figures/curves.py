@@ -14,11 +14,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-#: Quantile of the values at which the axis begins, so that the first, much lower evaluations are
-#: cut off.
+#: The axis begins at this quantile of the values, so that the first, much lower evaluations are cut
+#: off.
 _KEPT: Final = 0.22
 _COUNT: Final = Quantity("primitives", "primitives", "", 0, 0.0)
-#: Width of the markers of all arms together, relative to the distance between two groups.
+#: Width of the range over which the markers of all arms are spread, relative to the distance
+#: between two groups.
 _SPREAD: Final = 0.62
 _POINTS = 301
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 _MOST_ROWS: Final = 24
 #: Intervals are drawn this far above the middle of their row, and the markers of pairs below it.
 _ABOVE: Final = 0.12
-#: Letters per line of a heading, and the height of each further line in rows.
+#: Number of characters per line of a heading, and height of each additional line in units of rows.
 _LETTERS, _LINE = 70, 0.6
 _COLORS: Final = {
     Verdict.DIFFERENT: "#D55E00",
@@ -54,7 +54,8 @@ def draw_differences(c: Comparison) -> Drawn | None:
         ax = figure.subplots()
         ax.axvspan(-margin, margin, color=FAINT, alpha=0.13, linewidth=0)
         ax.axvline(0.0, color=FAINT, linewidth=0.8)
-        # The pairs limit the axis: with two pairs, the interval of a table row can span many dB.
+        # The differences of the pairs limit the axis. With two pairs, an interval of the table can
+        # span many dB.
         dots = [pair.difference for row in rows for pair in row.pairs]
         low, high = min([*dots, -2.0 * margin]), max([*dots, 2.0 * margin])
         ax.set_xlim(low - 0.1 * (high - low), high + 0.1 * (high - low))

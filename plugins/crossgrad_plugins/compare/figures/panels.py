@@ -28,9 +28,10 @@ if TYPE_CHECKING:
 _IN_A_ROW: Final = 4
 #: Width of a figure with a single panel, as a share of the page.
 _SINGLE: Final = 0.62
-#: A line with at most this many points has markers; on longer lines, markers would hide the line.
+#: A line with at most this many points has markers. On longer lines, markers would hide the line.
 _MOST_MARKERS: Final = 4
-#: Maximum points of a line; seeds evaluated at different seconds would give too many.
+#: Maximum number of points of a line. Seeds that were evaluated at different seconds would give
+#: more points.
 _MOST_POINTS: Final = 60
 
 

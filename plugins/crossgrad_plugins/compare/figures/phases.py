@@ -18,7 +18,7 @@ from crossgrad_plugins.compare.figures.style import (
 from crossgrad_plugins.compare.quantity import SECONDS
 
 _OTHER = "other"
-#: Letters per line of an arm's name next to its bar.
+#: Number of characters per line of an arm's name next to its bar.
 _LETTERS = 40
 _HATCHES = ("", "", "", "", "", "", "", "///", "...", "xxx")
 

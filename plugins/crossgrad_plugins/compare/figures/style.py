@@ -19,7 +19,7 @@ COLORS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9
 MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X")
 DASHES: Final = ("-", (0, (5, 1.6)), (0, (1, 1)), (0, (4, 1.2, 1, 1.2)))
 INK, FAINT, GRID = "#1a1a1a", "#666666", "#e2e2e2"
-#: Widths in inches: a page of a paper without its margins, and a column.
+#: Widths in inches: of a page of a paper without its margins, and of a text column.
 PAGE, COLUMN = 7.0, 3.4
 _RC: Final[Any] = {
     "axes.edgecolor": FAINT,
@@ -52,12 +52,14 @@ _RC: Final[Any] = {
     "ytick.labelsize": 7.5,
 }
 _DPI: Final = 220
-#: Letters per page width, letters that a label's marker and gap take, and the divisor of the line
-#: length by which the lines of a label are shortened in one step.
+#: Number of characters per page width, and number of characters that the marker and the gap of a
+#: label take. The third number is a divisor: one step shortens the lines of a label by the line
+#: length divided by it.
 _LETTERS, _BESIDE, _LETTERS_AT_ONCE = 110, 8, 10
-#: Legend lines that every figure has space for, and the height of a line in inches.
+#: Number of legend lines for which every figure has space, and height of a line in inches.
 _LEGEND_LINES, _LINE = 2, 0.18
-#: A name may be broken after these characters, and anywhere in a longer part without them.
+#: A name may be broken after the characters in brackets. A longer part without these characters may
+#: be broken anywhere.
 _PARTS: Final = re.compile(r"[^\s_./-]{1,18}[\s_./-]*|[\s_./-]+")
 _SVG: Final = re.compile(r"<svg\b.*", re.DOTALL)
 _ID: Final = re.compile(r'(\bid="|url\(#|href="#)')
@@ -228,7 +230,7 @@ def legend_above(
         box = made.get_window_extent()
         if box.width <= figure.bbox.width or letters <= _BESIDE:
             break
-        made.remove()  # The letters are wider than estimated.
+        made.remove()  # The characters were wider than estimated, so try shorter lines.
         if columns > 1:
             columns -= 1
         else:

@@ -46,7 +46,8 @@ _OFFSET, _STRETCH = np.float32(OFFSET), np.float32(STRETCH)
 _SLOPE, _EXPONENT = np.float32(SLOPE), np.float32(EXPONENT)
 _ROOT = np.float32(1.0 / EXPONENT)
 _THRESHOLD, _THRESHOLD_LINEAR = np.float32(THRESHOLD), np.float32(THRESHOLD_LINEAR)
-# df/dstops divided by f + o in the power part of the curve, and by f in its straight part.
+# df/dstops divided by f + o in the power part of the sRGB curve, and divided by f in the straight
+# part.
 _OF_POWER, _OF_LINE = np.log(2.0) / EXPONENT, np.log(2.0)
 
 
@@ -140,8 +141,8 @@ def expose_back(
             values, after = load(image, start + lane), load(taken, start + lane)
             given = load(upstream, start + lane)
             before_line, after_line = values <= dark, after <= dark
-            # A value that leaves the straight part is divided by the product of itself and the
-            # exponent.
+            # If the gain moves a value out of the straight part of the curve, the divisor of the
+            # slope is the value times the exponent.
             below = where(before_line, exponent * values, values + offset)
             above = where(after_line, exponent * after, after + offset)
             slope = where(

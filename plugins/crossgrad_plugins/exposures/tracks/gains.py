@@ -27,8 +27,9 @@ if TYPE_CHECKING:
 #: Minimum number of usable observations for the gain of a photo.
 LEAST = 8
 #: Photos count as differing in exposure if three conditions hold. The standard deviation of the
-#: gains is at least the first value, in stops. It is at least this many times its own standard
-#: error. The gains reduce the deviation of observations by at least this share (docs/exposure.md).
+#: gains is at least the first value, in stops. It is also at least the second value times its own
+#: standard error. The gains reduce the deviation of observations by at least the third value, a
+#: share (docs/exposure.md).
 LEAST_SPREAD, LEAST_RATIO, LEAST_REDUCTION = 0.2, 4.0, 0.15
 #: If there are at least this many photos, the photo farthest from the mean is ignored, because all
 #: its points may be on an object that the other photos hide.
@@ -36,24 +37,26 @@ _ENOUGH = 5
 #: Maximum number of photos for the decision. If there are more, groups of consecutive photos are
 #: used, because consecutive photos show the same points.
 MOST_DECIDING, _CONSECUTIVE = 128, 8
-# Cached, because a run requests the gains several times and a scene does not change.
+# The results are cached, because a run requests the gains several times and a scene does not
+# change.
 _OF_TRAINING: "WeakKeyDictionary[Scene, TrackGains]" = WeakKeyDictionary()
 _DECIDING: "WeakKeyDictionary[Scene, TrackGains]" = WeakKeyDictionary()
-#: Huber's constant, in standard deviations: 95 % efficient for normal errors.
+#: Huber's constant in standard deviations. It gives an efficiency of 95 % for normal errors.
 _HUBER = 1.345
 #: Number of standard deviations of a normal distribution in one median absolute deviation.
 _NORMAL = 1.4826
 _ROUNDS = 12
-#: The direct solution is used if the mean number of photos that share points with a photo is at
-#: most the first value, and the total number of photos is above the second value. With fewer
+#: The equations are solved directly if the mean number of photos that share points with a photo is
+#: at most the first value, and the total number of photos is above the second value. With fewer
 #: photos, iterations converge quickly.
 _FEW, _SHORT = 64, 64
-#: Maximum error of the gains after the iterations, in stops; the rounding error is smaller.
+#: Maximum error of the gains after the iterations, in stops. The rounding error is smaller than
+#: this.
 _TOLERANCE = 1e-5
-#: Maximum number of photos for standard errors, because their matrix is dense.
+#: Standard errors are computed for at most this number of photos, because they need a dense matrix.
 _DENSE = 512
-#: Eigenvalues below this share of the largest one belong to the undetermined mean of a connected
-#: part.
+#: Eigenvalues below this share of the largest eigenvalue count as 0. They belong to the mean gain
+#: of a connected group of photos, which the observations do not determine.
 _RANK = 1e-9
 #: Residuals below this value, in stops, are rounding errors of 8-bit values.
 _SMALLEST = 1e-3

@@ -13,9 +13,9 @@ from torch import Tensor
 from crossgrad_core.plugin import Camera, Scene, UserError, View
 from crossgrad_plugins.exposures.srgb import decoded
 
-#: Maximum number of observations; if there are more, only every n-th point is used.
+#: Maximum number of observations. If there are more, only every n-th point is used.
 _MOST = 400_000
-#: Number of photos decoded in parallel; more would need too much memory.
+#: Number of photos that are decoded in parallel. More photos would need too much memory.
 _AT_ONCE = 2
 #: Usable range of linear light in [0, 1]: values below it are noise, values above it are clipped.
 DARKEST, BRIGHTEST = 0.02, 0.98
@@ -129,8 +129,8 @@ def light_at(
     """
     pixels, depths = camera.project(points)
     height, width = image.shape[:2]
-    # The neighbours must also be inside the image. This test also removes numbers too large for an
-    # index.
+    # The neighbours must also be inside the image. This test also removes values that are too large
+    # for an index.
     inside = (pixels >= 1.0).all(axis=1) & (pixels < [width - 1, height - 1]).all(axis=1)
     rows = np.flatnonzero(inside & (depths > 0.0))
     right, down = (pixels[rows, axis].astype(np.int64) for axis in (0, 1))

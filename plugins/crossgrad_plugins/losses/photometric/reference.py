@@ -113,7 +113,8 @@ def blurred(fields: Tensor) -> Tensor:
     """Return Gaussian-weighted sums of [M, C, H, W] over each pixel's window, same shape."""
     if fields.numel() == 0:
         return fields
-    # One group per plane: torch's depthwise convolution is the fastest variant on the CPU.
+    # Use one group per plane, because torch's depthwise convolution is the fastest variant on the
+    # CPU.
     planes = fields.reshape(1, -1, *fields.shape[2:])  # [1, M * C, H, W]
     groups = planes.shape[1]
     weight = _window_for(fields.dtype, fields.device).expand(groups, 1, WINDOW)
@@ -167,7 +168,8 @@ def _dissimilarity_and_slope(
     variance_d = (square_d - dark).clamp_(min=0.0)
     bright.add_(2 * C1)
     over_mean, over_variance = 1 / (bright + dark), 1 / (variance_s + variance_d)
-    # 1 minus the luminance term and 1 minus the contrast-structure term: 0 where both are equal.
+    # 1 minus the luminance term, and 1 minus the contrast-structure term. Both are 0 if the images
+    # are equal.
     luminance, contrast = 2 * dark * over_mean, 2 * variance_d * over_variance
     dissimilarity = luminance + contrast - luminance * contrast
     by_variance = (1 - luminance).mul_(over_variance).mul_(over_variance).mul_(4)

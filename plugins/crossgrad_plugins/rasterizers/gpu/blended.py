@@ -7,9 +7,10 @@ import torch
 from torch import Tensor
 
 _NAMES: Final = ("means2d", "conics", "opacities", "isect_offsets", "flatten_ids")
-#: Number of pixels per call. gsplat lists every Gaussian of every pixel, with 24 bytes each.
+#: Number of pixels per call. For each pixel, gsplat lists every Gaussian and needs 24 bytes per
+#: entry.
 PIXELS: Final = 1 << 19
-#: Larger than the number of batches of Gaussians of any tile.
+#: A number larger than the number of batches of Gaussians in any tile.
 _ALL: Final = 1 << 30
 
 
@@ -32,8 +33,8 @@ def counter(meta: Mapping[str, Any], view: int) -> Callable[[Tensor], Tensor]:
         total: Tensor = opacities.new_zeros(opacities.shape[-1], dtype=torch.int64)
         rows = max(1, PIXELS // width)
         for first in range(0, height, rows):
-            # Pixels without remaining transmittance are skipped like opaque pixels, so set the
-            # transmittance of unmarked pixels to 0.
+            # gsplat skips pixels whose transmittance is used up. Set the transmittance of unmarked
+            # pixels to 0, so that gsplat skips them too.
             light = opacities.new_zeros((*opacities.shape[:-1], height, width))
             band = slice(first, first + rows)
             light[view, 0, band] = marked[band].to(light)

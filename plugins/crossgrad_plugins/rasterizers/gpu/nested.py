@@ -75,7 +75,7 @@ class _Nested(torch.autograd.Function):
             [output for output, _ in with_gradient],
             wanted,
             [gradient for _, gradient in with_gradient],
-            retain_graph=True,  # Another backward pass may follow.
+            retain_graph=True,  # Keep the graph, because another backward pass may follow.
             allow_unused=True,
         )
         by_tensor = {

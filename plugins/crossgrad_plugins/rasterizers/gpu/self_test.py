@@ -14,11 +14,12 @@ from torch import Tensor
 from crossgrad_core.plugin import Camera, Gaussians, Rasterizer, UserError
 from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer
 
-#: Largest difference of a pixel: a few Gaussians at the edge of their footprint, 1/255 each.
+#: Maximum difference of a pixel. It occurs if a few Gaussians differ at the edge of their
+#: footprint, by 1/255 each.
 PIXEL: Final = 0.02
-#: Largest mean difference of pixels, and relative difference of the loss.
+#: Maximum mean difference of pixels, and maximum relative difference of the loss.
 MEAN: Final = 5e-4
-#: Largest relative difference of the gradients of a tensor.
+#: Maximum relative difference of the gradients of a tensor.
 GRADIENT: Final = 2e-2
 _SIZE: Final = (70, 50)
 _NUMBER: Final = 200

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from crossgrad_core.numerics.simd import WIDE, fma, load_wide, picking, store
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 
-#: Size of the rows x, y, z and inverse distance of sixteen directions.
+#: Number of floats for x, y, z and the inverse distance of sixteen directions.
 WAYS = 4 * WIDE
-#: Number of basis functions of all degrees, equal to the lanes of a vector; and their floats for
-#: sixteen directions.
+#: Number of basis functions of all degrees, which is equal to the number of lanes of a vector.
+#: Number of floats of the basis functions for sixteen directions.
 BASIS = WIDE
 TABLE = BASIS * WIDE
 _X, _Y, _Z, _INVERSE = 0, WIDE, 2 * WIDE, 3 * WIDE
@@ -33,8 +33,8 @@ _C3_XYZ = 2.890611442640554  # sqrt(105 / (4 pi))
 _C3_XZZ = 0.4570457994644658  # sqrt(21 / (32 pi))
 _C3_ZZZ = 0.3731763325901154  # sqrt(7 / (16 pi))
 _C3_XXZ = 1.445305721320277  # sqrt(105 / (16 pi))
-# Two rows exchange blocks of s lanes. The first group gives the new first row, the second group the
-# new second row.
+# Two rows exchange blocks of s lanes. The first group of permutations gives the new first row, and
+# the second group gives the new second row.
 _first_1, _first_2, _first_4, _first_8 = (
     picking([WIDE + lane - s if lane & s else lane for lane in range(WIDE)]) for s in (1, 2, 4, 8)
 )
@@ -110,7 +110,7 @@ def pull_ways(degree: int, v: NDArray[np.float32], ways: NDArray[np.float64]) ->
     """
     for j in range(WIDE):
         x, y, z = ways[j + _X], ways[j + _Y], ways[j + _Z]
-        # Derivatives by x, y and z, taken as independent.
+        # Derivatives with respect to x, y and z, which are treated as independent variables.
         v_x = v_y = v_z = 0.0
         if degree >= 1:
             v_x, v_y, v_z = -_C1 * v[j + 2 * WIDE], -_C1 * v[j], _C1 * v[j + WIDE]
@@ -171,11 +171,11 @@ def turned(source: NDArray[np.float32], target: NDArray[np.float32]) -> None:
         store(target, (r + 8) * WIDE, _second_8(a, b))
 
 
-#: Number of basis functions of degree 1 and higher, and of floats of their coefficients.
+#: Number of basis functions of degree 1 and higher, and number of floats of their coefficients.
 HIGHER = BASIS - 1
 FLOATS = 3 * HIGHER
 _TRIPLES = 5  # per vector
-_SECOND, _LAST = 3 * _TRIPLES, FLOATS - WIDE  # start of the second and of the last vector
+_SECOND, _LAST = 3 * _TRIPLES, FLOATS - WIDE  # start of the second vector and of the last vector
 
 
 def _functions(first: int) -> list[int]:
@@ -188,18 +188,18 @@ def _channels(first: int) -> list[int]:
 
 
 # The last lane of the first vector belongs to the second vector, and the last lane of the second
-# vector belongs to the next. The last vector has an extra float in its first lane instead, so that
-# nothing beyond the 45 floats is read or written.
+# vector belongs to the third vector. Instead, the third vector has an extra float in its first
+# lane, so that nothing beyond the 45 floats is read or written.
 _spread_first = picking([*_functions(0)[:-1], 0])
 _spread_second = picking([*_functions(_SECOND)[:-1], 0])
 _spread_last = picking(_functions(_LAST))
 _rgb, _rgb_last = picking(_channels(0)), picking(_channels(_LAST))
 _onwards = picking([*range(1, WIDE), 0])
 _six_on = picking([*range(6, WIDE), *range(6)])
-#: Lanes 3 to 5 of the first vector, then 12 to 14 of the second one.
+#: Lanes 3 to 5 of the first vector, then lanes 12 to 14 of the second vector.
 _three_on, _twelve_on = picking([3, 4, 5, *range(3, WIDE)]), picking([28, 29, 30, *range(3, WIDE)])
 #: Select one channel of the five triples of each vector: first from two vectors, then from the
-#: third.
+#: third vector.
 _channel_of_two = [
     picking([*range(c, 15, 3), *range(WIDE + c, WIDE + 15, 3), *([0] * 6)]) for c in range(3)
 ]
@@ -257,7 +257,7 @@ def spread(
     """
     basis, three = load_wide(bases, row), load_wide(v_rgb, row)
     rgb, rgb_last = _rgb(three, three), _rgb_last(three, three)
-    # The order matters: the spare float of a vector is overwritten by the next vector.
+    # Keep this order, because each vector writes one spare float that the next vector overwrites.
     store(v_rest, to, _spread_first(basis, basis) * rgb)
     store(v_rest, to + _SECOND, _spread_second(basis, basis) * rgb)
     store(v_rest, to + _LAST, _spread_last(basis, basis) * rgb_last)

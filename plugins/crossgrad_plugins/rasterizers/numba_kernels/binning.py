@@ -45,21 +45,22 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 )
 from crossgrad_plugins.rasterizers.numba_kernels.sorting import order_by_depth
 
-#: Number of parts of the chunks for counting. It is fixed, so that results do not depend on the
-#: number of threads.
+#: The chunks are counted in this number of parts. The number is fixed, so that results do not
+#: depend on the number of threads.
 PARTS = 16
 
-#: Number of records whose spans are computed before the first of their tiles is written. Loops of
-#: unknown length would make the processor wait for the square roots of each record.
+#: Number of records whose spans are computed before the first of their tiles is written. With
+#: smaller groups, loops of unknown length would make the processor wait for the square roots of
+#: each record.
 _GROUP = 32
 
-#: Start of each number of the ellipses of a group.
+#: Start positions of the values of the ellipses in the buffer of a group.
 _OF_SLOPE, _OF_DECAY, _OF_WIDTH, _OF_BUDGET, _OF_EXTENT, _OF_TILT = range(0, 6 * _GROUP, _GROUP)
 
-#: Number of records ahead for memory prefetches: first for the slot numbers, then for the slots.
+#: Memory is prefetched this many records ahead: first for the slot numbers, then for the slots.
 _FAR, _NEAR = 32, 16
 
-#: Data of a record for filling the lists.
+#: Data of a record that are needed to fill the lists.
 FIRST_SLOT, SLOTS, FIRST_ROW, LAST_ROW = 0, 1, 2, 3
 BUCKET = 4
 
@@ -147,7 +148,7 @@ def _spans(
     """
     zero = splat(np.float32(0.0))
     half = splat(np.float32(0.5))
-    # Pixel centres are at whole numbers in this function.
+    # In this function, pixel centres are at whole numbers.
     u = broadcast(records, at + U_WHOLE) + (broadcast(records, at + U_PART) - half)
     v = broadcast(records, at + V_WHOLE) + (broadcast(records, at + V_PART) - half)
     slope = broadcast(ellipses, _OF_SLOPE + k)
@@ -207,8 +208,8 @@ def _find(
             if begin > end:
                 continue
             tile = (block + row) * tile_columns + begin
-            # Most rows have one or two tiles, unpredictably, so these two cases share branch-free
-            # code.
+            # Most rows have one or two tiles, and the processor cannot predict which. Both cases
+            # therefore share branch-free code.
             more = np.intp(end > begin)
             tile_of_slot[slot] = tile
             tile_of_slot[slot + more] = tile + more
@@ -257,7 +258,7 @@ def find_tiles(
     ends = np.empty(_GROUP * LANES, np.float32)
     job = next_job(jobs, PARTS + 1)
     while job <= PARTS:
-        # Sorting is one job, and the longest one.
+        # Sorting is a single job. It takes the longest, so it starts first.
         if job == 0:
             order[:] = order_by_depth(depths, order)
             job = next_job(jobs, PARTS + 1)

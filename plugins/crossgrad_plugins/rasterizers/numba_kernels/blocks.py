@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import Row, Triple
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 
-#: Number of Gaussians in a block; divides CHUNK.
+#: Number of Gaussians in a block. CHUNK is a multiple of this number.
 BLOCK = 128
 
 

@@ -14,7 +14,7 @@ from crossgrad_core.numerics.raster_constants import JACOBIAN_MARGIN
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 from crossgrad_plugins.rasterizers.numba_kernels.tiles.analytic import SIGMA_FLOOR
 
-#: px^4; the antialiased response removes footprints with a determinant up to this value.
+#: In px^4. The antialiased response removes footprints whose determinant is at most this value.
 LEAST_DET = 1e-6
 Triple = tuple[float, float, float]
 Row = tuple[float, float, float, float]

@@ -138,7 +138,8 @@ def backward(
         quats=np.empty((count, 4), np.float32),
         scales=np.empty((count, 3), np.float32),
         opacities=np.empty(count, np.float32),
-        # With harmonics, the colour gradients of Gaussians that were not rendered are never read.
+        # With spherical harmonics, the colour gradients of Gaussians that were not rendered are
+        # never read, so they need no zeros.
         colors=(np.zeros if gaussians.dc is None else np.empty)((count, 3), np.float32),
         dc=_room(frame, "sh_dc", gaussians.dc),
         rest=_room(frame, "sh_rest", gaussians.rest) if harmonics else None,

@@ -25,13 +25,14 @@ from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 #: Width and height of a tile, in pixels.
 TILE_WIDTH = 64
 TILE_HEIGHT = 16
-#: A patch is 4 x 4 pixels, processed together in vectors whose lanes are the pixels column by
-#: column. The common values of the rows are then a plain load. A tile's patches are numbered along
-#: its rows of patches. Their number equals the number of bits of an integer.
+#: A patch contains 4 x 4 pixels. They are processed together in a vector whose lanes are the pixels
+#: column by column, so that values common to a row can be loaded directly. The patches of a tile
+#: are numbered along the rows of patches. Their number is equal to the number of bits of an
+#: integer.
 SIDE = 4
 COLUMNS = TILE_WIDTH // SIDE
-#: Columns are counted from this column of a tile. The shorter the distance, the more precise is a
-#: float32 position.
+#: Columns are counted from this column of a tile. At a shorter distance from it, a float32 position
+#: is more precise.
 MIDDLE = TILE_WIDTH // 2
 PATCHES = COLUMNS * TILE_HEIGHT // SIDE
 #: Number of Gaussians that one job of the projection handles.
@@ -47,29 +48,31 @@ WIDTH = 7  # 1 / DECAY
 LOG_OPACITY = 8  # log2 of the opacity (with the antialiasing factor)
 RED, GREEN, BLUE = 9, 10, 11
 DEPTH = 12
-#: Fields of a record of the analytic response that replace SLOPE to LOG_OPACITY.
-COSINE, SINE = 4, 5  # of the longer main axis
+#: Fields of a record of the analytic response. They replace the fields SLOPE to LOG_OPACITY.
+COSINE, SINE = 4, 5  # cosine and sine of the angle of the longer main axis
 INVERSE_1, INVERSE_2 = 6, 7  # 1 / standard deviation along each main axis, 1 / pixels
 PEAK = 8  # opacity times 2 pi times both standard deviations
-REACH_1, REACH_2 = 13, 14  # offsets along the main axes beyond which nothing is touched, pixels
-RADIUS = 15  # squared reach of both axes together, in sigmas beyond half a pixel
+REACH_1, REACH_2 = 13, 14  # offsets along the main axes beyond which no pixel is touched, pixels
+RADIUS = 15  # squared limit for both axes together, in standard deviations beyond half a pixel
 #: Number of sums over pixels that the backward pass writes per drawn Gaussian and tile.
 PARTIAL = 16
 SUM_1, SUM_D, SUM_Y, SUM_DD, SUM_YY, SUM_DY = 0, 1, 2, 3, 4, 5
 SUM_RED, SUM_GREEN, SUM_BLUE = 6, 7, 8
 SUM_DEPTH = 9
 SUM_ABS_X, SUM_ABS_Y = 10, 11
-#: Sums of the analytic response that replace SUM_D to SUM_DY.
+#: Sums of the analytic response. They replace the sums SUM_D to SUM_DY.
 SUM_U, SUM_V, SUM_SIGMA_1, SUM_SIGMA_2, SUM_TURN = 1, 2, 3, 4, 5
 LOG2_E = 1.0 / math.log(2.0)
 #: A pixel is touched if the exponent plus log2 of the opacity reaches this value.
 TOUCH = math.log2(ALPHA_THRESHOLD)
 #: Row extents are enlarged by this value, so that rounding loses no touched pixel.
 SPARE = 1e-4
-# 2**f on [-1/2, 1/2] by rising power: minimal maximum relative error (9e-8) with 2**0 exact.
+# Coefficients of 2**f on [-1/2, 1/2], from low to high power. They minimise the maximum relative
+# error (9e-8), with 2**0 exact.
 _EXP2 = (1.0, 0.6931470036506653, 0.24022242426872253, 0.05550733953714371)
 _EXP2_HIGH = (0.009671512991189957, 0.001326472032815218)
-# Adding this number rounds a small float32 to a whole number, in the lowest bits of the sum.
+# Adding this number rounds a small float32 number to a whole number. The lowest bits of the sum
+# contain the whole number.
 _ROUND = 1.5 * 2.0**23
 EXP2 = WIDE  # six coefficients, after the rounding constant
 LARGEST_ALPHA = 7 * WIDE
@@ -77,10 +80,10 @@ TOUCHED = 8 * WIDE
 STOPPED = 9 * WIDE
 ONE = 10 * WIDE
 FINISHED = 11 * WIDE
-FIXED = FINISHED  # the odds of an alpha that no parameter changes
+FIXED = FINISHED  # marker in place of the odds of a capped alpha, which no parameter changes
 CAPPED = 12 * WIDE
 LEAST = 13 * WIDE
-OFFSETS = 14 * WIDE  # pixel offsets from the middle, by columns of patches
+OFFSETS = 14 * WIDE  # pixel offsets from the middle column, by columns of patches
 #: The constants that `exp2` uses.
 Terms = tuple[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes]
 
@@ -105,7 +108,7 @@ def vector_constants(max_alpha: float) -> NDArray[np.float32]:
     flat = np.concatenate([np.repeat(np.array(values, dtype=np.float32), WIDE), offsets])
     room = np.empty(len(flat) + WIDE, np.float32)
     shift = -(room.ctypes.data // room.itemsize) % WIDE
-    # The array starts at a cache line, so that no vector crosses two lines.
+    # Start the array at a cache line, so that no vector crosses two lines.
     constants = room[shift : shift + len(flat)]
     constants[:] = flat
     return constants

@@ -21,9 +21,10 @@ from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
 from crossgrad_plugins.rasterizers.numba_kernels.layout import CHUNK
 from crossgrad_plugins.rasterizers.numba_kernels.tiles.directions import BINS, FIELDS, SUMS
 
-#: An axis shorter than this on the image (pixels) is seen end on and has no direction.
+#: An axis that is shorter than this on the image (pixels) points along the viewing direction, so it
+#: has no direction on the image.
 SHORTEST = 1e-6
-#: The unit of the gradients of plain records.
+#: Unit of the gradients that are computed from plain records.
 _PLAIN_UNIT = 2.0 * math.log(2.0)
 
 

@@ -52,8 +52,8 @@ from crossgrad_plugins.rasterizers.numba_kernels.records import (
     write_plain,
 )
 
-#: Number of standard deviations at which a Gaussian of opacity 1 has faded, plus 1 % for poses that
-#: are not exactly rigid.
+#: Distance in standard deviations at which the alpha of a Gaussian with opacity 1 falls below the
+#: threshold. 1 % is added for poses that are not exactly rigid.
 _SIGMAS = 1.01 * math.sqrt(-2.0 * math.log(ALPHA_THRESHOLD))
 #: Factor for depth comparisons, because the same depth may be rounded differently here.
 _NEARER = 1.0 - 1e-9
@@ -108,7 +108,8 @@ def _may_be_drawn(
         inside = (off_x <= (half_x + spare) * z + ball_x * ball) & (
             off_y <= (half_y + spare) * z + ball_y * ball
         )
-        # The footprint of an opacity above 1 reaches farther.
+        # A Gaussian with an opacity above 1 reaches farther, so it is kept even if it is outside
+        # these limits.
         flags[k] = (z > near * _NEARER) & (opacity >= ALPHA_THRESHOLD) & (inside | (opacity > 1.0))
 
 
@@ -229,7 +230,7 @@ def _record_block(
         if limits is not None:
             published, within = square(k, width, height, projected)
             if z > near and z < math.inf:
-                # The Gaussian is visible for the published code, even if it touches no pixel.
+                # In the published code, the Gaussian is visible even if it touches no pixel.
                 radii[i] = published
         if not (z > near and z < math.inf and opacity >= ALPHA_THRESHOLD and opacity < math.inf):
             continue

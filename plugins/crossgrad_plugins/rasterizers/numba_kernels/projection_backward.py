@@ -60,7 +60,8 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 from crossgrad_plugins.rasterizers.numba_kernels.reduction import add_up
 from crossgrad_plugins.rasterizers.numba_kernels.tiles.analytic import main_axes
 
-# Rows of a block: the sums in their order, the parameters of its Gaussians, and the results.
+# Rows of a block: first the sums in the order of the layout, then the parameters of its Gaussians,
+# then the results.
 _MEAN = PARTIAL
 _QUAT = _MEAN + 3
 _SCALE = _QUAT + 4
@@ -147,7 +148,7 @@ def _unproject_block(
         v_row_x, v_row_y = weighted_sum(columns, v_p), weighted_sum(columns, v_q)
         v_slope_x = -camera.fx * inverse_z * dot(pose_z, v_row_x)
         v_slope_y = -camera.fy * inverse_z * dot(pose_z, v_row_y)
-        # u = fx x / z + cx; the Jacobian's slope is x / z only inside its bounds
+        # u = fx x / z + cx; the Jacobian uses x / z as its slope only inside its bounds
         v_ratio_x = camera.fx * v_u + (v_slope_x if slope_x == ratio_x else 0.0)
         v_ratio_y = camera.fy * v_v + (v_slope_y if slope_y == ratio_y else 0.0)
         v_inverse_z = z * (dot(row_x, v_row_x) + dot(row_y, v_row_y))

@@ -43,29 +43,33 @@ from crossgrad_plugins.rasterizers.numba_kernels.tiles.analytic import (
 )
 
 #: Rows of a block of projected Gaussians, visible or not: camera depth, projected mean (pixels),
-#: dilated 2-D covariance (px^2), its determinant (negative if the Gaussian cannot be drawn), and
-#: the factor of the opacity.
+#: dilated 2-D covariance (px^2), determinant of the covariance (negative if the Gaussian cannot be
+#: drawn), and the factor of the opacity.
 CAMERA_DEPTH, MEAN_U, MEAN_V, VARIANCE_X, COVARIANCE, VARIANCE_Y, DETERMINANT, FACTOR = range(8)
-#: Rows of the plain response: 1 / variance in y, slope of the rows' centres, variance and decay of
-#: the rows, log2 of the opacity, and both half-extents of the footprint, pixels.
+#: Rows of the plain response: 1 / variance in y, slope of the line through the centres of the pixel
+#: rows, variance and decay along a pixel row, log2 of the opacity, and both half-extents of the
+#: footprint (pixels).
 _INVERSE_C, _SLOPE, _VARIANCE, _DECAY, _LOG_OPACITY, _EXTENT_X, _EXTENT_Y = range(8, 15)
 FOUND = 15
 
 #: The published footprint: number of standard deviations, lower bound of the squared half
-#: difference of the variances (px^4), and side of its tiles, pixels.
+#: difference of the variances (px^4), and side of the tiles (pixels).
 SIGMAS, LEAST_SPREAD, SQUARE = 3.0, 0.1, 16.0
-#: First and last pixel column, first and last pixel row.
+#: First and last pixel column, and first and last pixel row.
 Rectangle = tuple[float, float, float, float]
-#: Numbers of a record except mean and colour, in the order of the layout. Plain response: SLOPE to
-#: LOG_OPACITY. Analytic response: COSINE to INVERSE_2, REACH_1 to RADIUS, PEAK.
+#: Numbers of a record except the mean and the colour, in the order of the layout. For the plain
+#: response, they are SLOPE to LOG_OPACITY. For the analytic response, they are COSINE to INVERSE_2,
+#: REACH_1 to RADIUS, and PEAK.
 Plain = tuple[float, float, float, float, float]
 Analytic = tuple[float, float, float, float, float, float, float, float]
 
 _LARGEST_RADIUS = 2.0**30
-# Gaussians with larger projected values are dropped; the limit is well inside float32.
+# Gaussians with larger projected values are dropped. This limit is well inside the range of
+# float32.
 _LARGEST = 1e30
 _STEEPEST = 1e15
-# Smallest decay in a record (px^-2): constant over any image, and its inverse is a valid float32.
+# Smallest decay in a record (px^-2). A Gaussian with this decay is constant over any image, and the
+# inverse of the decay is a valid float32 number.
 _FLAT = 1e-30
 
 # The bits of a float64: number of mantissa bits, exponent of 1, and the bits of 1.0.
@@ -282,7 +286,8 @@ def plain_shape(
     inverse_c, slope, variance, decay = get_four(found, _INVERSE_C, k)
     log_opacity = get(found, _LOG_OPACITY, k)
     reach = _reach(log_opacity)
-    # If any term is NaN or infinite, the sums are too, and they fail the comparison.
+    # If any term is NaN or infinite, the sums are NaN or infinite too, and they fail the
+    # comparison.
     if not (
         det > 0.0
         and reach >= 0.0

@@ -9,7 +9,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.binning import FIRST_SLOT, SLOT
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
 from crossgrad_plugins.rasterizers.numba_kernels.layout import CHUNK, PARTIAL
 
-#: Number of slots ahead for memory prefetches; records are consecutive in memory.
+#: Memory is prefetched this many slots ahead. Records are consecutive in memory.
 _AHEAD = 32
 
 

@@ -5,9 +5,10 @@ from numpy.typing import NDArray
 
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
 
-#: Maximum number of bits of a digit. With more, the counters would fill the first-level cache.
+#: Maximum number of bits of a digit. With more bits, the counters would fill the first-level cache.
 _DIGIT = 11
-#: Number of low bits of the float64 that are dropped: depths that agree to 2e-10 count as equal.
+#: Number of low bits of a float64 depth that are dropped. Depths that agree to 2e-10 then count as
+#: equal.
 _DROPPED = 20
 
 
@@ -31,9 +32,9 @@ def order_by_depth(depths: NDArray[np.float64], items: NDArray[np.int32]) -> NDA
     count = items.shape[0]
     if count == 0:
         return items.copy()
-    # Positive floating-point numbers have the same order as their bit patterns. Relative to the
-    # smallest pattern they are short. So the index of an item fits into the same integer, and fewer
-    # digits are sorted.
+    # Positive floating-point numbers have the same order as their bit patterns. The difference of a
+    # pattern from the smallest pattern has few bits. The index of the item therefore fits into the
+    # same integer, and fewer digits are sorted.
     bits = depths.view(np.int64)
     least, most = bits[0] >> _DROPPED, bits[0] >> _DROPPED
     for i in range(count):

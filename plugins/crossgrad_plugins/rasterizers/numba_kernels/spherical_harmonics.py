@@ -33,8 +33,8 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 
 #: Number of floats in a cache line.
 _LINE = 16
-#: Number of Gaussians whose basis functions are computed before the first is used. Coefficients are
-#: prefetched this number of Gaussians ahead.
+#: Number of Gaussians whose basis functions are computed before the first function is used.
+#: Coefficients are also prefetched this many Gaussians ahead.
 _BLOCK = WIDE
 
 
@@ -121,7 +121,7 @@ def sh_forward(
                     colour = 0.5 + C0 * np.float64(dc[i, 0, channel])
                     colour += np.float64(colours[row + channel])
                     if not math.isfinite(colour):
-                        # The record reaches no pixel.
+                        # Change the record, so that the Gaussian reaches no pixel.
                         records[j * RECORD + LOG_OPACITY] = -math.inf
                         radii[i] = 0
                     records[j * RECORD + RED + channel] = max(colour, 0.0)

@@ -14,8 +14,9 @@ from crossgrad_plugins.rasterizers.reference.statistics import offsets
 
 #: Number of composited channels: RGB, depth, and ones for the accumulated opacity.
 CHANNELS = 5
-#: Up to this number of (pixel, Gaussian) entries, all intermediates are kept for the backward pass
-#: (about 0.4 GB in float64). With more entries, each tile is rendered again in the backward pass.
+#: With at most this number of (pixel, Gaussian) entries, all intermediate results are kept for the
+#: backward pass (about 0.4 GB in float64). With more entries, each tile is rendered again in the
+#: backward pass.
 REMEMBERED_ENTRIES = 2**21
 #: Side of a tile, pixels.
 TILE = 16
@@ -70,8 +71,8 @@ def composite_tiles(
     Returns:
         `channels` [H, W, 5], `touched` [V] bool and `blended` [V] int64 as in `composite`.
     """
-    # The backward pass of an embedding adds in a fixed order on every device; indexing may use any
-    # order.
+    # Use an embedding, because its backward pass adds in a fixed order on every device. The
+    # backward pass of indexing may use any order.
     tiles = torch.split(embedding(lists.rows, table), lists.sizes)
     again = len(lists.rows) * TILE**2 > REMEMBERED_ENTRIES
     images, touched, blended = [], [], []
@@ -160,10 +161,11 @@ def _blends(table: Tensor, centers: Tensor, drawing: Drawing) -> tuple[Tensor, T
     alpha = alpha.clamp(max=drawing.max_alpha)
     touching = alpha >= ALPHA_THRESHOLD
     alpha = torch.where(touching, alpha, 0.0)
-    # Transmittance behind each Gaussian if compositing does not stop.
+    # Transmittance behind each Gaussian, computed as if compositing did not stop.
     after = (1 - alpha).cumprod(-1)
     before = torch.cat([torch.ones_like(after[:, :1]), after], -1)[:, :-1]
-    # Transmittance never rises, so all Gaussians behind the first one that stops are excluded too.
+    # Transmittance never increases. All Gaussians behind the first Gaussian that stops compositing
+    # are therefore excluded too.
     blended = touching & (after >= TRANSMITTANCE_STOP)
     return touching, blended, torch.where(blended, alpha * before, 0.0)
 

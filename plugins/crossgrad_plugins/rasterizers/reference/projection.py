@@ -15,9 +15,9 @@ from crossgrad_core.numerics.raster_constants import ALPHA_THRESHOLD, JACOBIAN_M
 from crossgrad_core.numerics.rotations import unit_rotation_matrices
 from crossgrad_core.plugin import Camera, Response
 
-#: Mip-Splatting does not render Gaussians with a 2-D determinant up to this value, px^4.
+#: Mip-Splatting does not render Gaussians whose 2-D determinant is at most this value, px^4.
 MIP_EPSILON = 1e-6
-#: Smallest standard deviation along an axis of the analytic response, px.
+#: Minimum standard deviation along an axis of the analytic response, px.
 SIGMA_FLOOR = 1e-3
 #: Analytic-Splatting approximates the normal distribution by sigmoid(LINEAR x + CUBIC x^3).
 LINEAR, CUBIC = 1.6, 0.07
@@ -64,8 +64,8 @@ def project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> Pro
     u = camera.fx * slope_x + camera.cx
     v = camera.fy * slope_y + camera.cy
 
-    # Far outside the image, the affine approximation is useless and its Jacobian becomes very
-    # large.
+    # Limit the slopes. Far outside the image, the affine approximation is useless and its Jacobian
+    # becomes very large.
     slope_x = slope_x.clamp(*_slopes(camera.width, camera.fx, camera.cx))
     slope_y = slope_y.clamp(*_slopes(camera.height, camera.fy, camera.cy))
     zero = torch.zeros_like(z)
@@ -73,11 +73,12 @@ def project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> Pro
     row_v = torch.stack([zero, camera.fy / z, -camera.fy * slope_y / z], -1)
     jacobian = torch.stack([row_u, row_v], 1)  # [N, 2, 3]
 
-    # The covariance is factor @ factor.T. For a zero quaternion, all values are NaN.
+    # The covariance is factor @ factor.T. If the quaternion is zero, all values are NaN.
     axes = unit_rotation_matrices(quats / quats.norm(dim=-1, keepdim=True)) * scales[:, None, :]
     factor = jacobian @ pose[:3, :3] @ axes  # [N, 2, 3]
     first, second = factor.unbind(1)
-    # Cauchy-Binet: a sum of squares. The formula xx * yy - xy^2 would lose precision for needles.
+    # Use the Cauchy-Binet formula, which is a sum of squares. The formula xx * yy - xy^2 would lose
+    # precision for needles.
     det = torch.linalg.cross(first, second).square().sum(-1)
     xx, xy, yy = first.square().sum(-1), (first * second).sum(-1), second.square().sum(-1)
     return Projection(torch.stack([u, v], -1), z, xx, xy, yy, det, factor)
@@ -122,7 +123,7 @@ def shape(projection: Projection, opacities: Tensor, dilation: float, response: 
     if response == "antialiased":
         opacities = opacities * _mip_factor(projection.det, det)
     conic = torch.stack([yy / det, -projection.xy / det, xx / det], -1)
-    # The level set alpha = 1/255 is an ellipse; these are its exact half-extents.
+    # The curve alpha = 1/255 is an ellipse. `reach` contains its exact half-extents.
     reach = (2 * _log_contrast(opacities)[:, None] * torch.stack([xx, yy], -1)).sqrt()
     return Shape(conic, opacities, opacities, reach, reach.amax(-1))
 
@@ -143,7 +144,8 @@ def coverage(dx: Tensor, dy: Tensor, parameters: Tensor, response: Response) -> 
         return 2 * pi * sigma1 * sigma2 * _window(u, sigma1) * _window(v, sigma2)
     a, b, c = parameters.unbind(-1)
     power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy
-    # Only rounding can make the power positive. The clamp keeps exp and its gradient finite then.
+    # Only rounding can make the power positive. In this case, the clamp keeps exp and its gradient
+    # finite.
     return power.clamp(max=0.0).exp() * (power <= 0)
 
 
@@ -165,7 +167,7 @@ def _log_contrast(peaks: Tensor) -> Tensor:
 def _windowed(projection: Projection, opacities: Tensor) -> Shape:
     """Return the shape for Analytic-Splatting: integrals over the pixel along the main axes."""
     middle, half = (projection.xx + projection.yy) / 2, (projection.xx - projection.yy) / 2
-    # A round Gaussian has no main axes; the axes of the image are used, without derivative.
+    # A round Gaussian has no main axes. Use the axes of the image instead, without a derivative.
     round_ = (half == 0) & (projection.xy == 0)
     half = torch.where(round_, 1.0, half)
     xy = torch.where(round_, 0.0, projection.xy)

@@ -9,10 +9,11 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import Screen
 
-#: Edges of the bins, in standard deviations along the axis.
+#: Edges of the bins along the axis, in standard deviations.
 EDGES = (-2.0, -1.0, 0.0, 1.0, 2.0)
 BINS, FIELDS = len(EDGES) + 1, 5
-#: An axis shorter than this on the image (pixels) is seen end on and has no direction.
+#: An axis that is shorter than this on the image (pixels) points along the viewing direction, so it
+#: has no direction on the image.
 SHORTEST = 1e-6
 
 

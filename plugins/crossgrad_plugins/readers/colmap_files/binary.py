@@ -203,7 +203,8 @@ def _open(path: Path) -> Iterator[_Walk]:
             "the file cannot be read", where=path, found=str(error), todo="check its permissions"
         ) from error
     with file:
-        # An empty file cannot be mapped. The map is closed with the last array that uses it.
+        # An empty file cannot be mapped. The map is closed when the last array that uses it is
+        # freed.
         empty = path.stat().st_size == 0
         yield _Walk(path, b"" if empty else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
 
@@ -241,14 +242,15 @@ def _read_points(file: _Walk) -> NDArray[np.void]:
     """Return the records [P] of type `_POINT`. Tracks, of any length, are skipped."""
     number = file.count(_POINT.itemsize + _COUNT.size)
     data, at, starts = file.data, file.at, []
-    # There may be millions of records, so this loop calls no function of ours.
+    # Call no Python function of this package in this loop, because there may be millions of
+    # records.
     track_length, fixed = _COUNT.unpack_from, _POINT.itemsize + _COUNT.size
     try:
         for _ in range(number):
             starts.append(at)
             at += fixed + _TRACK_ELEMENT * track_length(data, at + _POINT.itemsize)[0]
     except (struct.error, OverflowError):
-        # The track is longer than the file, or the offset is too large.
+        # This happens if the track is longer than the file, or if the offset is too large.
         at += fixed
     file.skip(at - file.at)
     file.end()

@@ -167,7 +167,7 @@ def _observed(line: bytes) -> list[int]:
     words = line.split()
     if len(words) % 3 or b"_" in line:
         raise ValueError(line)
-    np.array(words, dtype=np.float64)  # Pixels are not needed, but must be numbers.
+    np.array(words, dtype=np.float64)  # Pixel positions are not needed, but they must be numbers.
     return [_integer(word) for word in words[2::3] if word != _NO_POINT]
 
 

@@ -20,7 +20,7 @@ from crossgrad_plugins.georeference.gps_tags import Numbers, number
 from crossgrad_plugins.georeference.projection import Projection
 from crossgrad_plugins.readers.place.headers import Measured, measured
 
-#: Bytes of memory for each word in a list.
+#: Number of bytes in memory for each word in a list.
 _WORD: Final = 64
 _DEGREES: Final = re.compile(r"epsg:4326|wgs ?84|\+proj=(longlat|latlong)\b.*", re.IGNORECASE)
 _ZONE: Final = "(0?[1-9]|[1-5][0-9]|60)"
@@ -31,9 +31,9 @@ _PROJ_UTM: Final = re.compile(
 )
 _SHOWN: Final = 80
 _POSITION: Final = struct.Struct("<3d")
-_LONGEST: Final = 1 << 20  # bytes of a text, a blob or a row
-_WGS84: Final = 0  # of COLMAP's PosePriorCoordinateSystem
-#: The column of the photo's id: in COLMAP 4, and in older versions.
+_LONGEST: Final = 1 << 20  # number of bytes of a text, a blob or a row
+_WGS84: Final = 0  # a value of COLMAP's PosePriorCoordinateSystem
+#: The column of the photo's id: first in COLMAP 4, then in older versions.
 _COLUMNS: Final = ("corr_data_id", "image_id")
 
 
@@ -174,7 +174,7 @@ def _positions(
     """
     table_rows = database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
     tables = {row[0] for row in islice(table_rows, most)}
-    # A view of the database may compute without an end.
+    # Refuse views of the database, because a view may compute without an end.
     if not {"images", "pose_priors"} <= tables:
         return
     there = {row[1] for row in database.execute("PRAGMA table_info(pose_priors)")}

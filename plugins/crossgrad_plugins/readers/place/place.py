@@ -86,7 +86,7 @@ def _sources(
             try:
                 yield _listed(path, names)
             except UserError as error:
-                # A run does not need the georeference, so the error becomes a note.
+                # A run does not need the georeference, so report the error as a note.
                 notes.append(f"{path.name} contains no positions: {error.what} ({error.found})")
     yield of_headers({view.name: _file_of(view, raw) for view in scene.views}, "GPS of the photos")
 

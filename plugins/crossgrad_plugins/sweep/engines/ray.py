@@ -17,9 +17,9 @@ from crossgrad_plugins.sweep.engines import Work
 from crossgrad_plugins.sweep.job import Job
 
 OPTIONS: Final = ("address",)
-#: Maximum seconds to wait for ended tasks.
+#: Maximum number of seconds of one wait for tasks that have ended.
 _PAUSE = 0.25
-#: Seconds in which a cluster must answer.
+#: Number of seconds in which a cluster must answer.
 _PATIENCE = 10.0
 
 
@@ -116,7 +116,8 @@ def _connected(work: Work) -> ModuleType:
             found=" ".join(str(error).split()),
             todo="start it with `ray start --head`, and give the address that it prints",
         ) from error
-    for number, handler in handlers.items():  # Ray installs its own signal handlers.
+    # Restore the signal handlers, because Ray installs its own.
+    for number, handler in handlers.items():
         signal.signal(number, handler)
     module: ModuleType = ray
     return module

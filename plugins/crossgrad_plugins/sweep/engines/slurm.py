@@ -16,7 +16,7 @@ from crossgrad_plugins.sweep.attempt import Outcome, Retries, Worker, carried_ou
 from crossgrad_plugins.sweep.engines import Work
 from crossgrad_plugins.sweep.job import Job
 
-#: Options that are passed to sbatch unchanged.
+#: Options that the sweep passes to sbatch unchanged.
 SBATCH: Final = (
     *("partition", "account", "qos", "constraint", "exclude", "nodelist", "gres", "comment"),
 )
@@ -98,7 +98,7 @@ class _WorkerPool:
         self._work = work
         self._submitit = _submitit()
         self._executor = _executor(work, self._submitit)
-        # Only Slurm has a queue; other clusters start all submitted jobs at once.
+        # Only Slurm has a queue. Other clusters start all submitted jobs at once.
         queued = self._executor.cluster == "slurm"
         self._most = len(work.jobs) if queued else work.workers or 1
         self._waiting = deque(work.jobs)

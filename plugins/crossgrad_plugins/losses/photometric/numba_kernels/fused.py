@@ -71,7 +71,7 @@ def _tile(
     absolute, dissimilarity = 0.0, 0.0
     set_centres(scratch, image, target, target_8bit, is_8bit, mask, is_masked, box, width)
     loaded = top - halo - RADIUS
-    # Rows are processed in pairs; the last pair may contain an unused row.
+    # Rows are processed in pairs. The second row of the last pair may be unused.
     for first in range(top - halo, bottom + halo, 2):
         while loaded <= first + 1 + RADIUS:
             load_row(

@@ -25,27 +25,29 @@ from crossgrad_plugins.losses.photometric.reference import RADIUS, WINDOW, gauss
 
 TILE_ROWS = 64
 TILE_COLUMNS = 384
-#: Rows of a ring: a power of two, larger than WINDOW, because the windows of two rows overlap.
+#: Number of rows of a ring buffer. It is a power of two and larger than WINDOW, because the windows
+#: of two rows overlap.
 SLOTS = 16
 CHANNELS = 3
 #: Number of floats by which a window extends beyond its centre column.
 HALO = CHANNELS * RADIUS
-# Space for a tile with twice the halo on both sides, and for vectors that start before its end.
+# Number of floats for a tile with twice the halo on both sides, and for vectors that start before
+# its end.
 _ROOM = CHANNELS * TILE_COLUMNS + 4 * HALO + CHANNELS * WINDOW + 3 * WIDE
 STRIDE = _ROOM + -_ROOM % WIDE
-#: Position of the ring of s - centre.
+#: Position of the ring buffer of s - centre.
 SUM = 0
-#: Position of the ring of d - centre.
+#: Position of the ring buffer of d - centre.
 DIFFERENCE = SUM + SLOTS * STRIDE
-#: Position of the ring of the mask: 1 for a pixel that counts, else 0.
+#: Position of the ring buffer of the mask: 1 for a pixel that counts, else 0.
 KEEP = DIFFERENCE + SLOTS * STRIDE
-#: Position of s, s^2, d, d^2 of two rows, summed down the columns.
+#: Position of s, s^2, d and d^2 of two rows after the vertical filter.
 PARTIAL = KEEP + SLOTS * STRIDE
-#: Position of the rings of a, b, c.
+#: Position of the ring buffers of a, b and c.
 BY_MEAN = PARTIAL + 8 * STRIDE
 BY_SUM_VARIANCE = BY_MEAN + SLOTS * STRIDE
 BY_DIFFERENCE_VARIANCE = BY_SUM_VARIANCE + SLOTS * STRIDE
-#: Position of a, b, c of two rows, summed down the columns.
+#: Position of a, b and c of two rows after the vertical filter.
 BACK = BY_DIFFERENCE_VARIANCE + SLOTS * STRIDE
 #: Position of one row of results.
 LINE = BACK + 6 * STRIDE
@@ -73,7 +75,7 @@ def set_centres(
     """
     top, bottom, left, right = box
     for channel in range(CHANNELS):
-        count = 1e-9  # If no pixel is kept, the sums are 0, and so are the centres.
+        count = 1e-9  # If no pixel counts, this divisor makes the centres 0.
         sum_x, sum_y = 0.0, 0.0
         for row in range(top, bottom, 8):
             for column in range(left, right):
@@ -82,7 +84,7 @@ def set_centres(
                 count += 1.0
                 i = (row * width + column) * CHANNELS + channel
                 y = np.float32(target_8bit[i]) / _WHITE if is_8bit else target[i]
-                # In this order of arguments, a NaN counts as 0.
+                # With this order of arguments, a NaN counts as 0.
                 sum_x += float(min(max(_ZERO, image[i]), _ONE))
                 sum_y += float(min(max(_ZERO, y), _ONE))
         centre_sum = np.float32((sum_x + sum_y) / count)
@@ -92,7 +94,8 @@ def set_centres(
             scratch[CENTRE_DIFFERENCE + j] = centre_difference
 
 
-# Let loops use views from index 0, because LLVM does not vectorise indices that can be negative.
+# Give loops views that start at index 0, because LLVM does not vectorise indices that can be
+# negative.
 
 
 @part
@@ -140,14 +143,15 @@ def load_row(
 
     Outside the image and at masked pixels, both images are 0.
     """
-    first = CHANNELS * (box[2] - 2 * RADIUS)  # float column of the image at the ring's column 0
+    # Float column of the image that is at column 0 of the ring buffer
+    first = CHANNELS * (box[2] - 2 * RADIUS)
     count = CHANNELS * (box[3] - box[2] + 4 * RADIUS)
     slot = (row & (SLOTS - 1)) * STRIDE
     s, d, keep = SUM + slot, DIFFERENCE + slot, KEEP + slot
     begin, end = 0, 0
     if 0 <= row < height:
         begin, end = max(0, -first), min(count, CHANNELS * width - first)
-    # Load x and y first; s and d then replace them in place.
+    # Load x and y first. Then s and d replace them in place.
     for ring in (s, d, keep):
         fill(scratch, ring, begin, _ZERO)
         fill(scratch, ring + end, count - end, _ZERO)

@@ -77,7 +77,8 @@ def ssim_row(scratch: _Floats, row: int, columns: int, partial: int) -> None:
         dark = mean_d * mean_d
         over_mean = one / (bright + dark)
         over_variance = one / (variance_s + variance_d)
-        # 1 minus the luminance term and 1 minus the contrast-structure term: exactly 0 if x = y.
+        # 1 minus the luminance term, and 1 minus the contrast-structure term. Both are exactly 0 if
+        # x = y.
         luminance_loss = two * dark * over_mean
         contrast_loss = two * variance_d * over_variance
         dissimilarity = fnma(luminance_loss, contrast_loss, luminance_loss + contrast_loss)

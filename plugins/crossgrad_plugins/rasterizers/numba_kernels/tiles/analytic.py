@@ -55,15 +55,17 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 from crossgrad_plugins.rasterizers.numba_kernels.tiles.footprint import reached_patches
 
 LINEAR, CUBIC = 1.6, 0.07
-#: Smallest standard deviation along a main axis, px.
+#: Minimum standard deviation along a main axis, px.
 SIGMA_FLOOR = 1e-3
-#: Largest standard deviation: constant over any image, and the product of two is a valid float32.
+#: Maximum standard deviation. A Gaussian of this size is constant over any image, and the product
+#: of two such values is a valid float32 number.
 SIGMA_CEILING = 1e18
 _ROOT_2_PI = math.sqrt(2.0 * math.pi)
-#: F'(x) <= F'(0) exp(-TAIL x^2 / 2) for all x, with F'(0) = LINEAR / 4; a test checks this.
+#: F'(x) <= F'(0) exp(-TAIL x^2 / 2) for all x, with F'(0) = LINEAR / 4. A test checks this.
 TAIL = 0.9975
 
-# (1 - exp(-D)) / D on [0, 1/2] by rising power: minimal maximum relative error (8e-8).
+# Coefficients of (1 - exp(-D)) / D on [0, 1/2], from low to high power. They minimise the maximum
+# relative error (8e-8).
 _SERIES = (
     0.999999922724565,
     -0.4999924984754078,
@@ -72,7 +74,8 @@ _SERIES = (
     0.006771038068732109,
 )
 
-#: Row buffer: offsets along both axes of the pixel centre in the middle column of each row.
+#: Row buffer: for each row, the offsets of the pixel centre in the middle column along both main
+#: axes.
 ROW_U = 0
 ROW_V = TILE_HEIGHT
 
@@ -95,7 +98,8 @@ def main_axes(a: float, b: float, c: float, det: float) -> tuple[float, float, f
     spread = math.sqrt(half * half + b * b)
     double_cosine = half / spread if spread > 0.0 else 1.0
     double_sine = b / spread if spread > 0.0 else 0.0
-    # Compute the larger of |cosine| and |sine| by a square root, and the smaller from it.
+    # Compute the larger of |cosine| and |sine| by a square root, and compute the smaller value from
+    # the larger.
     main = math.sqrt(0.5 * (1.0 + abs(double_cosine)))
     other = 0.5 * abs(double_sine) / main
     cosine = main if half >= 0.0 else other
@@ -135,7 +139,7 @@ def squared_radius(opacity: float) -> float:
     Therefore alpha is at most 2 pi F'(0)^2 exp(-TAIL (d1^2 + d2^2) / 2) times the opacity.
     """
     contrast = 2.0 * math.pi * (LINEAR / 4.0) ** 2 * opacity / ALPHA_THRESHOLD
-    # `SPARE` is larger than the rounding errors of all values that are compared with the result.
+    # `SPARE` is larger than the rounding errors of all values that are compared with this result.
     return 2.0 / TAIL * math.log(max(contrast, 1.0)) + SPARE
 
 
@@ -158,13 +162,14 @@ def fill_axis_rows(
     cosine, sine = broadcast_wide(records, record + COSINE), broadcast_wide(records, record + SINE)
     reach_1 = broadcast_wide(records, record + REACH_1)
     reach_2 = broadcast_wide(records, record + REACH_2)
-    # One lane per row of the tile.
+    # Each lane belongs to one row of the tile.
     dy = first_dy + ramp_wide()
     u = fma(sine, dy, cosine * dx)
     v = fnma(sine, dx, cosine * dy)
     store(rows, base + ROW_U, u)
     store(rows, base + ROW_V, v)
-    # Pixel x is at u + cosine x and v - sine x. A division by zero gives infinite bounds.
+    # The pixel in column x is at u + cosine x and v - sine x along the main axes. A division by
+    # zero gives infinite bounds.
     low_1, high_1 = (zero - reach_1 - u) / cosine, (reach_1 - u) / cosine
     low_2, high_2 = (v - reach_2) / sine, (v + reach_2) / sine
     first = round_up(larger(smaller(low_1, high_1), smaller(low_2, high_2)))

@@ -99,8 +99,8 @@ from crossgrad_plugins.rasterizers.numba_kernels.tiles.pixel_states import (
     start_tile,
 )
 
-#: Numbers of a patch, WIDE each: alpha (later replaced by the gradient by the exponent) and its
-#: odds.
+#: Values of a patch, WIDE numbers each: alpha and the odds of alpha. Later, the gradient with
+#: respect to the exponent replaces alpha.
 _ALPHA, _ODDS = 0, WIDE
 _RESPONSE = 2 * WIDE
 
@@ -136,8 +136,8 @@ def _respond(
         dx = offsets - broadcast_four_wide(rows, row + ROW_CENTRE)
         power = fnma(decay * dx, dx, broadcast_four_wide(rows, row + ROW_EXPONENT))
         touched = power >= load_wide(constants, TOUCHED)
-        # If a pixel is not touched, alpha is undefined (possibly NaN): select values, never
-        # multiply.
+        # If a pixel is not touched, alpha is undefined and possibly NaN. Select values by a mask
+        # and never multiply them by 0.
         alpha = smaller(exp2(power, terms), load_wide(constants, LARGEST_ALPHA))
         alpha = where(touched, alpha, zero)
         store(responses, at + _ALPHA, alpha)
@@ -277,7 +277,7 @@ def _gather(
     sum_1, sum_d, sum_y, sum_dd, sum_yy, sum_dy, sum_abs_x, sum_abs_y = _moments(
         patches, records, record, rows, base, constants, absolute, responses
     )
-    # The order is the order of the fields in the layout.
+    # Keep the order of the fields in the layout.
     red, green = halves_added(sum_red), halves_added(sum_green)
     store(partials, partial, sums(sum_1, sum_d, sum_y, sum_dd, sum_yy, sum_dy, red, green))
     partials[partial + SUM_BLUE] = total(halves_added(sum_blue))
@@ -352,7 +352,7 @@ def _gather_analytic(
         if absolute is not None:
             sum_abs_x = sum_abs_x + magnitude(fnma(sine, sv, cosine * su))
             sum_abs_y = sum_abs_y + magnitude(fma(cosine, sv, sine * su))
-    # The order is the order of the fields in the layout.
+    # Keep the order of the fields in the layout.
     eight = sums(
         halves_added(sum_1),
         halves_added(sum_u),
@@ -407,7 +407,8 @@ def _backward(
             prefetch(records, np.intp(entries[min(entry + 2 * BATCH, stop - 1), 0]) * RECORD)
             prefetch_write(partials, np.intp(entries[entry, 1]) * PARTIAL)
             batch[filled] = entry
-            # Branch-free code: the next entry overwrites an entry without a mask.
+            # To avoid a branch, write every entry. The next entry overwrites an entry whose mask is
+            # empty.
             filled += np.intp(masks[entry] != 0)
             entry += 1
         for k in range(filled):

@@ -99,9 +99,9 @@ from crossgrad_plugins.rasterizers.numba_kernels.tiles.pixel_states import (
 )
 
 BINS, FIELDS = 6, 5
-#: Number of sums per entry: the sums of the bins, and two that are not used.
+#: Number of sums per entry: the sums of the bins, and two sums that are not used.
 SUMS = 4 * LANES
-#: Number of entries ahead for prefetches of records.
+#: Records are prefetched this many entries ahead.
 _AHEAD = 8
 _SMALL, _UP = np.float32(2.0**-60), np.float32(2.0**90)
 _LARGE, _DOWN = np.float32(2.0**60), np.float32(2.0**-66)
@@ -145,13 +145,14 @@ def _spread(
     hx, hy = gx * splat(width), gy * splat(height)
     largest = larger(magnitude(hx), magnitude(hy))
     moved = splat(np.float32(0.0)) < largest
-    # Powers of two that keep the squares within the range of float32, for any gradients.
+    # Scale by powers of two, so that the squares of any gradients stay within the range of float32.
     scale = where(largest < splat(_SMALL), splat(_UP), one)
     scale = where(splat(_LARGE) < largest, splat(_DOWN), scale)
     hx, hy = hx * scale, hy * scale
     inverse = one / square_root(fma(hx, hx, hy * hy))
     hx, hy, gx, gy = hx * inverse, hy * inverse, magnitude(gx), magnitude(gy)
-    # Positions rise or fall along rows and columns of pixels, so the corners bound the bins.
+    # Positions along the axis increase or decrease along rows and columns of pixels. The corners of
+    # the patch therefore bound the bins.
     store(places, 0, along)
     a, b = _bin(places[0]), _bin(places[SIDE - 1])
     c, d = _bin(places[LANES - SIDE]), _bin(places[LANES - 1])
@@ -268,7 +269,7 @@ def _entry(
     """Write the sums of one Gaussian over the reached patches of a tile to slot_sums[at:]."""
     half = splat(np.float32(0.5))
     axis_x, axis_y = broadcast(axes, axis), broadcast(axes, axis + 1)
-    # Pixel centres are at whole numbers here, as in `fill_rows`.
+    # Here, pixel centres are at whole numbers, as in `fill_rows`.
     u = (broadcast(records, record + U_WHOLE) - splat(np.float32(left))) + (
         broadcast(records, record + U_PART) - half
     )
@@ -290,7 +291,7 @@ def _entry(
         dy = y + splat(np.float32(row_of(patch))) - v
         along = fma(axis_x, dx, axis_y * dy)
         _spread(first_half(gx), first_half(gy), along, width, height, places, binned)
-        # The second half of the patch is to the right.
+        # The second half of the patch is to the right of the first half.
         along = fma(axis_x, dx + splat(np.float32(SIDE // 2)), axis_y * dy)
         _spread(last_half(gx), last_half(gy), along, width, height, places, binned)
     for group in range(SUMS // LANES):

@@ -46,7 +46,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     WIDTH,
 )
 
-#: Row buffer of one Gaussian: centre, largest exponent and dy of each row.
+#: Row buffer of one Gaussian: the centre, the largest exponent and dy of each row.
 ROW_CENTRE = 0
 ROW_EXPONENT = TILE_HEIGHT
 ROW_DY = 2 * TILE_HEIGHT
@@ -68,7 +68,8 @@ def _reached_patches(at: Site, first: Any, last: Any) -> Any:
     )
     low = build.select(build.fcmp_ordered(">", first, zero), first, zero)
     high = build.select(build.fcmp_ordered("<", last, end), last, end)
-    # Edges outside may be NaN, which cannot be converted to an integer.
+    # Set edges outside the tile to 0, because they may be NaN, which cannot be converted to an
+    # integer.
     columns = [
         build.lshr(build.fptosi(build.select(inside, edge, zero), whole), number(whole, 2))
         for edge in (low, high)
@@ -86,7 +87,7 @@ def _reached_patches(at: Site, first: Any, last: Any) -> Any:
 
 #: Return the reached patches of the sixteen rows of a tile, given the first and last pixel of each
 #: row (no pixel if the comparison first <= last fails). Bit 16 r + c is the patch of columns 4 c to
-#: 4 c + 3 and rows 4 r to 4 r + 3. Pixels are counted from 0 to 63; others are left out.
+#: 4 c + 3 and rows 4 r to 4 r + 3. Only pixels 0 to 63 count.
 reached_patches: Callable[[Lanes, Lanes], np.uint64] = emitted(
     _reached_patches, types.uint64, SIXTEEN, SIXTEEN
 )
@@ -115,7 +116,7 @@ def fill_rows(
         broadcast_wide(records, record + V_PART) - half
     )
     row_decay = broadcast_wide(records, record + ROW_DECAY)
-    # One lane per row of the tile.
+    # Each lane belongs to one row of the tile.
     dy = ramp_wide() - v
     exponent = fnma(row_decay * dy, dy, broadcast_wide(records, record + LOG_OPACITY))
     centre = fma(broadcast_wide(records, record + SLOPE), dy, u)

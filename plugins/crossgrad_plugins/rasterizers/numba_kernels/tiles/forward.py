@@ -77,12 +77,13 @@ from crossgrad_plugins.rasterizers.numba_kernels.tiles.pixel_states import (
     row_of,
 )
 
-#: Number of entries whose reach is computed before any of them is blended, which hides the latency
-#: of memory reads and row extents. Finished patches are detected once per batch.
+#: Number of entries whose reach is computed before any of them is blended. Processing the entries
+#: in batches hides the latency of memory reads and of the row extents. Finished patches are
+#: detected once per batch.
 BATCH = 16
 
-# Side of the squares in which limits are counted, pixels; and the patches of the first column of
-# squares as bits.
+# Side in pixels of the squares that `limits` counts, and a bit mask of the patches in the first
+# column of squares.
 _SQUARE = int(SQUARE)
 _ABREAST = np.uint64(
     sum(1 << patch for patch in range(PATCHES) if patch % COLUMNS < _SQUARE // SIDE)
@@ -208,8 +209,8 @@ def _blend(
         else:
             alpha, left = _coverage(left, patch, offsets, rows, row, records, record, constants)
             touched = alpha >= least
-        # If a pixel is not touched, alpha is undefined (possibly NaN): select values, never
-        # multiply.
+        # If a pixel is not touched, alpha is undefined and possibly NaN. Select values by a mask
+        # and never multiply them by 0.
         alpha = where(touched, smaller(alpha, most), zero)
         before = load_wide(state, at + _T)
         weight = alpha * before
@@ -362,7 +363,8 @@ def _composite(
                 reached &= _within(limits, np.intp(entries[k, 0]), left)
             masks[k] = np.uint64(reached)
             batch[filled] = k
-            # Branch-free code: the next entry overwrites an entry that reaches nothing.
+            # To avoid a branch, write every entry. The next entry overwrites an entry that reaches
+            # no patch.
             filled += np.intp(reached != np.uint64(0))
         for k in range(filled):
             record = np.intp(entries[batch[k], 0]) * RECORD

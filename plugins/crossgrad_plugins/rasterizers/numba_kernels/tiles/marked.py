@@ -62,7 +62,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.tiles.pixel_states import (
     row_of,
 )
 
-#: Number of entries ahead for prefetches of records.
+#: Records are prefetched this many entries ahead.
 _AHEAD = 8
 
 
@@ -121,8 +121,8 @@ def _count(
         alpha = where(touched, smaller(alpha, load_wide(constants, LARGEST_ALPHA)), zero)
         before = load_wide(state, patch * WIDE)
         after = before - alpha * before
-        # Transmittance never rises: a pixel that has stopped, or is not marked, is never blended
-        # again.
+        # Transmittance never increases. A pixel that has stopped or is not marked is therefore
+        # never blended again.
         store(state, patch * WIDE, after)
         pixels += count_bits(bits(touched & (after >= load_wide(constants, STOPPED))))
     return pixels

@@ -33,11 +33,12 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 )
 
 _PLACES = [(x, y) for x in range(SIDE) for y in range(SIDE)]
-# Arranges two rows of eight pixels and two more rows as the left patch and the right patch.
+# Arrange four rows of eight pixels, given as two pairs of rows, as the left patch and the right
+# patch.
 _left_patch, _right_patch = (
     picking([y * LANES + start + x for x, y in _PLACES]) for start in (0, SIDE)
 )
-# Arranges the left and the right patch as the first two and the last two rows of pixels.
+# Arrange the left patch and the right patch as the first two rows and the last two rows of pixels.
 _first_rows, _last_rows = (
     picking([x // SIDE * WIDE + x % SIDE * SIDE + y for y in rows for x in range(LANES)])
     for rows in ((0, 1), (2, 3))
@@ -76,13 +77,13 @@ def four_rows(left: Lanes, right: Lanes) -> tuple[Lanes, Lanes, Lanes, Lanes]:
     return first_half(above), last_half(above), first_half(below), last_half(below)
 
 
-#: State of a patch, WIDE numbers each: transmittance (negative once finished), the remaining part S
-#: of the loss' linear form (see `backward`), and gradients of the three channels.
+#: State of a patch, WIDE numbers each: transmittance (negative once the pixel is finished), the
+#: remaining part S of the loss' linear form (see `backward`), and gradients of the three channels.
 PASSED, REST, V_RED, V_GREEN, V_BLUE = 0, WIDE, 2 * WIDE, 3 * WIDE, 4 * WIDE
 STATE = 5 * WIDE
 #: The gradients of the depths of all patches follow the states of all patches.
 DEPTHS = PATCHES * STATE
-#: Eight pixels: S, gradient of the three channels, gradient of the depth.
+#: Values of eight pixels: S, the gradients of the three channels, and the gradient of the depth.
 _Eight = tuple[Lanes, Lanes, Lanes, Lanes, Lanes]
 
 
