@@ -296,7 +296,7 @@ def test_a_regular_step_synchronizes_the_gpu_at_most_three_times(options):
     assert len(waits) <= 3, waits
 
 
-def test_steps_along_axes_agree_between_gpu_and_cpu():
+def test_steps_along_the_axes_of_gaussians_agree_between_gpu_and_cpu():
     draws = torch.Generator().manual_seed(0)
     arrays = [torch.randn(5000, columns, generator=draws) for columns in (3, 3, 3, 4)]
     on_gpu = [each.to("cuda") for each in arrays]

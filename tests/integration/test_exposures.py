@@ -79,7 +79,9 @@ def test_exposure_auto_is_off_if_photos_agree_and_changes_no_bit(scene, tmp_path
     assert not (tmp_path / "none" / "exposure.json").exists()
 
 
-def test_exposure_auto_is_gain_if_photos_differ_and_none_suggests_gain(varied, tmp_path):
+def test_exposure_auto_selects_gain_if_photos_differ_and_exposure_none_suggests_gain(
+    varied, tmp_path
+):
     assert run(varied, tmp_path / "auto") == 0
     assert run(varied, tmp_path / "gain", exposure={"name": "gain"}) == 0
     assert run(varied, tmp_path / "none", exposure={"name": "none"}) == 0

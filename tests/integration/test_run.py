@@ -210,7 +210,9 @@ def test_separate_gradients_kept_for_an_observer_give_the_same_bits(scene, tmp_p
     assert same(first.plugins["densifier"].per_primitive, second.plugins["densifier"].per_primitive)
 
 
-def test_joint_backward_agrees_to_rounding_and_counts_one_pass(scene, tmp_path):
+def test_joint_backward_agrees_with_separate_backward_to_rounding_and_counts_one_pass(
+    scene, tmp_path
+):
     run(scene, tmp_path / "separate", steps=3, eval_every=3)
     run(scene, tmp_path / "joint", steps=3, eval_every=3, backward="joint")
     first, second = parameters(tmp_path / "separate"), parameters(tmp_path / "joint")

@@ -72,7 +72,7 @@ def test_the_bounding_range_covers_all_axes_together():
 @pytest.mark.parametrize("edge", [0.3, 2.71, 16.77, 1e6])
 @pytest.mark.parametrize("levels", [1, 2, 4, 7])
 @pytest.mark.parametrize("fork", [2, 3])
-def test_the_level_below_the_middle_has_the_requested_cell_size(edge, levels, fork):
+def test_the_level_below_the_middle_has_about_the_requested_cell_size(edge, levels, fork):
     cell = root_cell(edge, -1, root_above(0.02, levels, fork))
     halvings = math.log2(edge / cell)
     assert halvings == pytest.approx(round(halvings), abs=1e-9)

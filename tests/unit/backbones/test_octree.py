@@ -124,7 +124,7 @@ def test_used_anchors_and_their_fade_factors_agree_with_the_formula(rounding):
     assert 0 < int(used.mask.sum()) < len(used.mask) or rounding in {"ceil", "progressive"}
 
 
-def test_a_moving_camera_fades_levels_in_and_always_uses_the_coarsest():
+def test_a_moving_camera_fades_levels_in_and_always_uses_the_coarsest_level():
     backbone, parameters, scene = leveled(rounding="progressive", visible_threshold=0.0)
     camera, before = scene.views[0].camera, None
     for far in np.geomspace(0.4, 40.0, 400):

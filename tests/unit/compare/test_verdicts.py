@@ -81,7 +81,7 @@ def test_a_difference_far_above_the_noise_stays_different_among_100_comparisons(
     assert verdicts([found] * 100) == [Verdict.DIFFERENT] * 100
 
 
-def test_bootstrap_p_values_fall_steadily_beyond_all_resamples():
+def test_bootstrap_p_values_decrease_steadily_beyond_the_range_of_resamples():
     law = Bootstrap.of(RNG.normal(0.0, 1.0, 12), ["a", "b", "c"] * 4)
     borders = np.linspace(1.0, 9.0, 33)
     above = [law.sf(border) for border in borders]
@@ -93,7 +93,7 @@ def test_bootstrap_p_values_fall_steadily_beyond_all_resamples():
 
 
 @pytest.mark.parametrize(("value", "expected"), [(0.0, "equivalent"), (0.5, "different")])
-def test_many_pairs_without_noise_get_the_verdict_of_few_pairs(value, expected):
+def test_without_noise_many_pairs_get_the_same_verdict_as_few_pairs(value, expected):
     family = [estimate([value] * pairs, ["a"] * pairs, 0.1) for pairs in (3, 12)]
     assert {str(verdict) for verdict in verdicts(family * 10)} == {expected}
 

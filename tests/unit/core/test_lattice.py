@@ -28,12 +28,12 @@ def test_packing_a_lattice_keeps_every_number():
 
 
 @pytest.mark.parametrize("fork", [2, 3])
-def test_cells_shrink_by_the_factor_fork_from_level_to_level(fork):
+def test_cells_of_each_finer_level_are_smaller_by_the_factor_fork(fork):
     cells = lattice(fork=fork).cells(torch.arange(5))
     assert cells.tolist() == pytest.approx([0.5 / fork**level for level in range(5)], rel=1e-15)
 
 
-def test_lattice_sites_are_the_nearest_ones_and_their_positions_map_back_to_the_sites():
+def test_lattice_sites_are_nearest_to_their_points_and_recovered_from_their_positions():
     rng = np.random.default_rng(0)
     points, levels = cloud(rng)
     grid = lattice()

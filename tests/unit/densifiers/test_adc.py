@@ -130,7 +130,7 @@ def test_transparent_gaussians_are_pruned_and_large_ones_only_after_a_reset():
     assert late.source.tolist() == [2]
 
 
-def test_the_largest_gradients_grow_first_near_the_limit_and_skipped_ones_are_counted():
+def test_the_largest_gradients_grow_first_near_the_limit_and_skipped_gaussians_are_counted():
     view = record([[1e-5, 0], [3e-5, 0], [2e-5, 0], STILL], [1] * 4)
     ctx = context([view], step=600, params=parameters((0.005,) * 4), room=1)
     edit, _ = AdaptiveDensityControl().densify(ctx, PluginState())

@@ -147,7 +147,7 @@ def test_the_largest_error_per_visit_grows_first_near_the_limit():
     assert edit.counts["held_back"] == 2
 
 
-def test_half_of_the_pruning_candidates_are_removed_and_the_remaining_ones_capped():
+def test_half_of_the_pruning_candidates_are_removed_and_remaining_opacities_are_capped():
     params = few([1e-4] * 7, [0.001, 0.002, 0.003, 0.004, 0.9, 0.79, 0.81])
     state = planted([0] * 7, [0.0] * 7, [0.0] * 7, error=[0.0, 1.0, 0.9999, 0.0, 0.0, 0.0, 0.0])
     edit, _ = Planted().densify(context(params=params), state)
@@ -194,7 +194,7 @@ def test_opacities_are_reset_as_published_and_a_reset_overrides_the_cap():
 
 
 @pytest.mark.parametrize(("total", "every"), [(30_000, 500), (12_000, 200), (3_000, 100)])
-def test_the_interval_between_edits_is_the_published_one(total, every):
+def test_the_interval_between_edits_is_as_published(total, every):
     schedule = Schedule.for_run(total)
     window = MultiViewDensityControl().window(schedule)
     assert (window.densify_from, window.densify_every) == (500, every)

@@ -226,7 +226,7 @@ def test_decreased_opacities_are_finite_and_none_increases():
 
 
 @pytest.mark.parametrize(("mode", "total"), [("scaled", 30_000), ("absolute", 7_000)])
-def test_density_control_ends_at_27_000_without_resets(mode, total):
+def test_density_control_ends_at_step_27_000_without_opacity_resets(mode, total):
     schedule = Schedule.for_run(total, mode)
     window = RevisingDensification().window(schedule)
     assert (window.densify_from, window.densify_until) == (500, 27_000)

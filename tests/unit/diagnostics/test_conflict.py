@@ -70,7 +70,7 @@ def test_zero_far_gradients_have_no_ratio(squared):
     assert np.isnan(ratio.median)
 
 
-def test_ratios_of_different_units_are_joined_by_their_geometric_mean():
+def test_ratios_are_averaged_by_their_geometric_mean():
     assert geometric_mean((2.0, 8.0)) == pytest.approx(4.0)
     assert np.isnan(geometric_mean((2.0, float("nan"))))
 
@@ -152,7 +152,7 @@ def test_constant_conflict_has_no_correlation(gramian):
 
 
 @pytest.mark.parametrize("views", [4, 6, 8])
-def test_an_equally_good_permutation_counts_despite_rounding_of_its_sum(views):
+def test_permutations_that_equal_the_observed_statistic_count_despite_rounding(views):
     # One pair conflicts, the nearest camera with the farthest one: no other is as far apart.
     pairs, values = views * (views - 1) / 2, []
     for seed in range(20):

@@ -155,7 +155,7 @@ def test_estimates_are_inside_their_intervals_if_possible(seed):
     assert found.between.low >= 0.0
 
 
-def test_only_a_wide_gap_has_an_interval_above_zero():
+def test_only_a_wide_gap_between_groups_has_an_interval_above_zero():
     rows, near = sample(shift=3.0)
     assert ends(rows, near)[1, 0] > 0.0
     rows, near = sample(shift=0.0)

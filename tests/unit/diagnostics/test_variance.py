@@ -61,7 +61,7 @@ def test_estimates_from_independent_probes_are_unbiased():
     assert np.mean([each.between for each in found]) == pytest.approx((shift**2).sum() / 4)
 
 
-def test_a_probe_of_all_cameras_gives_the_numbers_of_the_paper():
+def test_a_gradient_probe_of_all_cameras_gives_the_numbers_of_the_paper():
     near, far = population()
     found = split(near, far, cameras=(len(near), len(far)))
     assert found.within == pytest.approx((plain_variance(near) + plain_variance(far)) / 2)

@@ -224,7 +224,7 @@ def test_a_subset_of_many_photos_decides_the_gains():
     assert deciding_gains(few) is training_gains(few)
 
 
-def test_a_part_of_many_observations_is_used(monkeypatch):
+def test_only_a_subset_of_many_observations_is_used(monkeypatch):
     scene = grey_scene([0.1, 0.2, 0.4])
     module = "crossgrad_plugins.exposures.tracks.observations._MOST"
     monkeypatch.setattr(module, 60)

@@ -169,13 +169,13 @@ def test_terciles_have_equal_shares():
     assert [labels.count(name) for name in ("near", "middle", "far")] == [6, 6, 6]
 
 
-def test_anchors_put_thirty_percent_on_either_side():
+def test_the_anchors_grouping_labels_thirty_percent_near_and_thirty_percent_far():
     scene = on_a_line(*np.linspace(1.0, 2.0, 10))
     labels = Anchors().fit(scene, np.random.default_rng(0)).labels(scene.views)
     assert [labels.count(name) for name in ("near", "middle", "far")] == [6, 8, 6]
 
 
-def test_anchors_work_without_a_middle_group():
+def test_the_anchors_grouping_works_without_a_middle_group():
     scene = posed_scene([posed_view((0, 0, 0), "a.png"), posed_view((1, 0, 0), "b.png")])
     three = posed_scene([*scene.views, posed_view((5, 0, 0), "c.png")])
     labels = Anchors(share=0.5).fit(three, np.random.default_rng(0)).labels(three.views)

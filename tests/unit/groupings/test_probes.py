@@ -75,7 +75,7 @@ def test_the_focal_length_decides_if_all_cameras_are_at_one_position():
     assert labels == ("far", "near", "near", "far")
 
 
-def test_the_conflict_signature_starts_with_the_radial_split_without_a_probe():
+def test_without_a_gradient_probe_the_conflict_signature_is_the_radial_split():
     scene = names("a.png", "b.png", "c.png", "d.png")
     rule = ConflictSignature(at=7).fit(scene, RNG)
     assert rule.labels(scene.views) == Radial().fit(scene, RNG).labels(scene.views)
@@ -110,7 +110,7 @@ def test_the_conflict_signature_ignores_lengths_and_zero_gradients():
     assert labels[0] == labels[2] != labels[1] == labels[3]
 
 
-def test_views_without_a_probe_get_the_label_of_the_nearest_probed_view():
+def test_views_without_probed_gradients_get_the_label_of_the_nearest_probed_view():
     probe = VectorProbe([[1.0]] * 5 + [[-1.0]] * 5)
     scene = names(*(f"{i}.png" for i in range(10)))
     labels = ConflictSignature(cameras=4).fit(scene, RNG, probe).labels(scene.views)
@@ -125,7 +125,7 @@ def test_cosines_are_averaged_over_blocks_with_nonzero_gradients():
     assert np.allclose(mean_cosines(gramians), [[1.0, -1.0], [-1.0, 1.0]])
 
 
-def test_the_cut_is_finite_for_exactly_opposite_gradients():
+def test_the_spectral_cut_is_finite_for_exactly_opposite_gradients():
     cosines = np.array([[1.0, 1.0, -1.0], [1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
     sides = spectral_cut(cosines)
     assert sides[0] == sides[1] != sides[2]

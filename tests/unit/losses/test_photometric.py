@@ -198,7 +198,7 @@ def test_the_reference_gradient_agrees_with_finite_differences(kept):
     assert torch.autograd.gradcheck(lambda x: l1_ssim_loss(x, target, kept), image, fast_mode=True)
 
 
-def test_the_window_is_a_normalised_gaussian():
+def test_the_ssim_window_is_a_normalised_gaussian():
     window = gaussian_window()
     assert window.sum().item() == pytest.approx(1, abs=1e-15)
     assert (window[6] / window[5]).item() == pytest.approx(np.exp(-1 / (2 * 1.5**2)))

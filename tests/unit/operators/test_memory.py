@@ -93,7 +93,7 @@ def test_gradnorm_favours_the_group_whose_loss_decreases_slowly(ask):
     assert found.weights[0] > found.weights[1]
 
 
-def test_gradnorm_gives_the_views_of_a_group_one_weight(ask):
+def test_gradnorm_gives_all_views_of_a_group_the_same_weight(ask):
     rows = np.random.default_rng(0).standard_normal((4, 6)) * [[9.0], [1.0], [9.0], [1.0]]
     weights = repeat(ask, "gradnorm", rows, 50).weights
     assert weights[0] == weights[2] < weights[1] == weights[3]

@@ -184,7 +184,7 @@ def test_blocks_are_compared_and_averaged_run_by_run(modules, planted, grid_of):
     assert found[0].figure.startswith("+0.800") and found[2].figure.startswith("0.400")
 
 
-def test_shares_of_the_gap_in_the_papers_tables_contradict_its_text(modules):
+def test_the_tables_of_the_paper_contradict_its_text_about_the_closed_gap(modules):
     """The text says 80 to 100 % on four of five scenes; its tables do not."""
     claims = modules.data.read_claims()
     claim = next(c for s in claims.sections for c in s.claims if c.id == "gap-closed")

@@ -191,7 +191,7 @@ def test_decisions_become_settings(bundled):
     assert json.loads(json.dumps(data)) == data
 
 
-def test_pairs_of_views_are_decided_only_with_a_probe():
+def test_pairs_of_views_are_decided_only_with_a_gradient_probe():
     found = grouping.pairs(evidence_of("city_hybrid"))
     assert found.basis == "default"
     assert "--probe" in found.evidence
@@ -207,7 +207,7 @@ def test_pairs_of_views_are_decided_only_with_a_probe():
         (np.nan, np.nan, np.nan, "default", {}),
     ],
 )
-def test_pairs_of_views_are_decided_by_the_whole_interval(low, rho, high, status, changes):
+def test_pairs_of_views_are_decided_by_the_whole_interval_of_rho(low, rho, high, status, changes):
     probe = Probe(rho=rho, rho_low=low, rho_high=high, noise_scale=50.0, conflict=0.5)
     found = grouping.pairs(evidence_of("city_hybrid", probe))
     assert found.basis == status
@@ -295,7 +295,7 @@ def test_projection_is_chosen_for_pairs_from_the_sampler_of_the_user(given, choi
         ({"grouping": {"name": "percentile", "q": 20}}, {"name": "percentile", "q": 20}),
     ],
 )
-def test_the_probe_uses_the_groups_of_the_run(given, grouping):
+def test_the_gradient_probe_uses_the_grouping_of_the_run(given, grouping):
     assert evidence_of("city_hybrid", **given).grouping.model_dump() == grouping
 
 
@@ -361,7 +361,7 @@ def test_projection_requires_pairs_and_conflict_beyond_chance(conflict_low, rho_
     assert grouping.operator(evidence_of("city_unimodal", probe)).choice == "sum"
 
 
-def test_a_failed_probe_decides_nothing():
+def test_a_failed_gradient_probe_decides_nothing():
     probe = Probe(problem="a probe needs at least two training views in each group")
     evidence = evidence_of("city_hybrid", probe)
     for part in (grouping.pairs, grouping.operator):

@@ -110,7 +110,9 @@ def test_viewing_directions_in_a_narrow_cone_decide_nothing(monkeypatch):
         ((500, np.nan, np.nan, np.nan), "3", "default"),
     ],
 )
-def test_the_whole_interval_decides_about_sh_bands(figures, choice, basis, monkeypatch):
+def test_the_whole_interval_of_view_dependence_decides_about_sh_bands(
+    figures, choice, basis, monkeypatch
+):
     measured = view_dependence.ViewDependence(*figures)
     monkeypatch.setattr(view_dependence, "view_dependence", lambda scene: measured)
     found = appearance.degree(Evidence(configured({"scene": "nowhere"}), ring()))

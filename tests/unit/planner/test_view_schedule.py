@@ -46,7 +46,7 @@ def decision(scene, **given):
     return view_schedule(Evidence(configured({"scene": "x", "steps": 100, **given}), scene))
 
 
-def test_the_far_first_schedule_is_chosen_if_near_views_look_around():
+def test_the_far_first_schedule_is_chosen_if_only_near_views_look_in_many_directions():
     scene = scene_of(AROUND)
     found = decision(scene)
     assert found.basis == "decided"
@@ -167,7 +167,7 @@ def test_a_small_far_mode_does_not_get_the_far_first_schedule():
     assert found.evidence == "the smaller mode has 33% of the views"
 
 
-def test_far_views_in_all_directions_do_not_differ_in_direction():
+def test_far_views_in_many_directions_do_not_differ_from_near_views_in_direction():
     low = scene_of(AROUND).views[12:]
     ring = [(np.cos(angle), np.sin(angle), 0) for angle in np.linspace(0, 2 * np.pi, 12, False)]
     high = [posed_view((0, 0, 90.0), f"{i}.png", forward=f) for i, f in enumerate(ring)]

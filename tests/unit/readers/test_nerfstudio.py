@@ -71,7 +71,9 @@ def test_lens_values_of_a_frame_override_the_values_of_the_file(tmp_path):
         ({"fl_y": 41.0}, {"fl_x": 30.0, "fl_y": 31.0}, (30.0, 41.0)),
     ],
 )
-def test_a_focal_length_of_a_frame_is_not_mixed_with_that_of_the_file(own, shared, focal, tmp_path):
+def test_a_focal_length_of_a_frame_is_not_mixed_with_the_focal_length_of_the_file(
+    own, shared, focal, tmp_path
+):
     camera = read(write(tmp_path, own, **{"w": 24, "h": 16, **shared})).views[0].camera
     assert (camera.fx, camera.fy) == pytest.approx(focal)
 
@@ -98,7 +100,7 @@ def test_an_incomplete_focal_length_of_a_frame_is_an_error(tmp_path):
         ({"is_fisheye": True}, {"is_fisheye": True, "k1": 0.1}, "OPENCV_FISHEYE", (0.1, 0, 0, 0)),
     ],
 )
-def test_distortion_of_a_frame_is_not_mixed_with_that_of_the_file(
+def test_distortion_of_a_frame_is_not_mixed_with_distortion_of_the_file(
     own, shared, model, terms, tmp_path
 ):
     frame, whole = (Fields(each, tmp_path / "transforms.json") for each in (own, LENS | shared))

@@ -16,7 +16,7 @@ def record(step: int, losses: tuple[float, ...] = (0.1, 0.3), seconds: float = 0
     return StepRecord(step, (0,) * len(losses), names, None, losses, 1234, {}, step * seconds)
 
 
-def test_the_progress_line_shows_loss_rate_and_time_left():
+def test_the_progress_line_shows_loss_steps_per_second_and_remaining_time():
     pace = Pace(total=1000)
     assert progress_line(pace) == ""
     for step in (1, 2, 3):

@@ -250,7 +250,7 @@ def test_the_floaters_rule_is_selected_by_default(given, what):
     assert bool(resolved(setup_of(**given)).rules.get("floaters")) == what
 
 
-def test_densifier_none_is_the_only_one_without_removal_of_floaters():
+def test_only_densifier_none_disables_the_removal_of_floaters():
     never = {n for n in entries("densifiers") if not build(Densifier, n, {}).edits}
     assert never == {"none"}
     said = (Path(__file__).parents[3] / "docs" / "rules.md").read_text(encoding="utf-8")

@@ -90,7 +90,7 @@ def expected(setup, state, bound):
     ("seed", "bound", "at_once"),
     [(0, None, 1), (1, None, 2**20), (2, 0.2, 1), (3, 0.2, 2**20), (4, 3.0, 1), (5, 3.0, 2**20)],
 )
-def test_axes_are_clamped_to_the_allowed_length(seed, bound, at_once, monkeypatch):
+def test_axes_of_gaussians_are_clamped_to_the_allowed_length(seed, bound, at_once, monkeypatch):
     monkeypatch.setattr(scale_clamp, "_AT_ONCE", at_once)
     setup = setup_of(rules=using(bound))
     state = at_random(setup, seed)

@@ -18,7 +18,7 @@ def two_points(n):
 @pytest.mark.parametrize(
     ("n", "expected"), [(10, 0.566), (100, 0.951), (200, 0.975), (500, 0.990), (1000, 0.995)]
 )
-def test_two_equal_points_stay_below_one_in_the_finite_sample_form(n, expected):
+def test_the_finite_sample_coefficient_of_two_equal_groups_is_below_one(n, expected):
     found = bimodality(two_points(n))
     assert found.sample == pytest.approx(expected, abs=5e-4)
     assert found.population == pytest.approx(1.0)
@@ -39,7 +39,7 @@ def test_every_distribution_on_two_points_has_a_population_coefficient_of_one(sh
         pytest.param(quantiles(expon), 5 / 9, id="exponential"),
     ],
 )
-def test_known_distributions_reach_their_limits(values, expected):
+def test_known_distributions_have_the_expected_coefficients(values, expected):
     found = bimodality(values)
     assert found.population == pytest.approx(expected, abs=2e-3)
     assert found.sample == pytest.approx(expected, abs=2e-3)

@@ -58,7 +58,7 @@ def test_a_file_with_an_exact_name_is_matched_with_no_other_name():
 
 
 @pytest.mark.parametrize("name", ["cam0/p0.png", "/data/cam0/p0.png"])
-def test_a_photo_missing_in_its_folder_is_not_replaced_by_one_of_another_folder(name):
+def test_a_photo_missing_in_its_folder_is_not_replaced_by_a_photo_of_another_folder(name):
     found = pair(("cam0/p1.png", "cam1/p0.png"), name)
     assert not found.files and not found.ambiguous
 

@@ -113,7 +113,7 @@ def test_a_damaged_entry_is_not_used(store, folder):
         assert entry.read_bytes() == good
 
 
-def test_the_checksum_of_an_entry_is_verified_again_only_after_other_use(
+def test_the_checksum_of_an_entry_is_verified_only_after_another_store_used_it(
     store, folder, monkeypatch
 ):
     source, sums = large(3), []

@@ -101,7 +101,7 @@ def test_the_regimes_of_each_candidate_split_use_its_training_views(tmp_path):
     assert sorted(set(asked)) == [24, 28]
 
 
-def test_lists_and_other_split_methods_need_no_regimes(tmp_path):
+def test_splits_by_lists_or_by_every_nth_photo_need_no_regimes(tmp_path):
     def label(_train):
         raise AssertionError
 

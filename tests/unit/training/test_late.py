@@ -68,7 +68,7 @@ class Both:
 
 
 @pytest.mark.parametrize("most", [0.2, 2.0])
-def test_rates_beyond_single_precision_are_infinite_without_a_warning(monkeypatch, most):
+def test_learning_rates_beyond_single_precision_are_infinite_without_a_warning(monkeypatch, most):
     monkeypatch.setattr(late, "MOST_ROWS", most)
     both = Both(torch.zeros(10, 3))
     both.step(np.arange(4), np.ones((4, 3), np.float32), 1e300, AdamRule())

@@ -45,7 +45,7 @@ def test_rows_are_in_morton_order():
 @pytest.mark.parametrize(
     ("far", "place"), [(torch.nan, 0), (-torch.inf, 0), (torch.inf, 2), (1e38, 2)]
 )
-def test_positions_without_a_cell_are_sorted_to_the_end(far, place):
+def test_positions_without_a_cell_are_sorted_to_the_start_or_the_end(far, place):
     """Where x is not a number or left of all cells it counts as the first cell, else the last."""
     positions = torch.tensor([[0.0, 0.0, 0.0], [far, 0.0, 0.0], [1.0, 0.0, 0.0]])
     assert along_curve(positions).tolist().index(1) == place

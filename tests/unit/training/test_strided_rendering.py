@@ -83,7 +83,7 @@ def test_gradients_of_all_corners_add_up_to_the_gradient_of_the_full_image():
 
 
 @pytest.mark.parametrize("stride", [2, 3, 4])
-def test_every_corner_is_used_equally_for_any_sampler_period(stride):
+def test_every_pixel_corner_is_used_about_equally_for_any_sampler_period(stride):
     for period in (1, 2, 3, 4, 7, 112):
         turns = Counter(corner_of(step, 0, stride) for step in range(1, 4000 * period, period))
         assert len(turns) == stride**2
@@ -124,7 +124,7 @@ def test_masks_are_sampled_at_the_same_pixels():
         (5, 3, 1 / 2, 1),
     ],
 )
-def test_every_photo_keeps_enough_pixels(width, height, scale, expected):
+def test_every_photo_keeps_enough_pixels_under_strided_rendering(width, height, scale, expected):
     resolution = build("resolutions", "strided", {})
     assert 1 / resolution.of_photo(posed_camera(width, height), scale) == pytest.approx(expected)
 
@@ -146,7 +146,7 @@ def scene_of(width, height):
          "8 x 8 to step 48, of each 4 x 4 to step 96, of each 2 x 2 to step 160"),
     ],
 )  # fmt: skip
-def test_stages_follow_the_size_of_the_photos(width, height, coarsest, scales, note):
+def test_strided_stages_follow_the_size_of_the_photos(width, height, coarsest, scales, note):
     scene, schedule = scene_of(width, height), Schedule.for_run(200)
     resolution = build("resolutions", "strided", {}).fitted_to(scene)
     assert resolution.coarsest == coarsest
@@ -174,7 +174,7 @@ def test_stages_follow_the_size_of_the_photos(width, height, coarsest, scales, n
     ("steps", "share"),
     [(100, 0.8), (3000, 0.8), (9487, 0.4), (29_999, 0.0), (30_000, 0.0), (40_000, 0.0)],
 )
-def test_longer_runs_reach_all_pixels_earlier(steps, share):
+def test_longer_runs_render_all_pixels_from_an_earlier_share_of_the_run(steps, share):
     resolution = build("resolutions", "strided", {"coarsest": 2})
     schedule = Schedule.for_run(steps)
     assert resolution.window(schedule) == pytest.approx(share * steps, abs=2e-4 * steps)

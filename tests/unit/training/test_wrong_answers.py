@@ -151,7 +151,7 @@ def test_fitted_to_must_return_a_component_of_its_slot(monkeypatch, base, slot, 
 
 
 @pytest.mark.parametrize("scales", ["a", (None,), ()])
-def test_scales_must_be_numbers(scales):
+def test_render_scales_must_be_numbers(scales):
     wrong = of_slot("resolutions", "full", "scales", (scales, PluginState()))
     assert refused(setup_of({"resolution": wrong})).what.startswith(
         "the resolution returned a wrong scale"
@@ -220,7 +220,7 @@ def test_correct_results_are_accepted():
 
 
 @pytest.mark.parametrize("name", sorted(TAKEN))
-def test_states_under_names_of_other_plugins_are_refused(name):
+def test_plugin_states_under_names_of_other_plugins_are_refused(name):
     plugin = Answers(DensifyResult(NO_EDIT, states={name: PluginState({"n": 1})}))
     error = refused(setup_of(stranger=plugin))
     assert repr(name) in error.what
@@ -347,7 +347,7 @@ def test_aggregated_gradients_must_fit_the_parameters(plugin, found):
     assert found in error.found
 
 
-def test_a_tensor_may_be_skipped_and_counts_may_be_numpy_numbers():
+def test_an_aggregation_may_skip_a_tensor_and_return_numpy_numbers_as_counts():
     counts = {"dropped": np.int64(2), "odd": torch.tensor(3)}
     setup = setup_of(
         wrapping=Wraps(lambda answer: replace(answer, counts=counts)), a=with_means(None)
@@ -376,7 +376,7 @@ def test_labels_may_be_a_list(labels):
     assert take_step(setup, first_state(setup)).labels == ("a",)
 
 
-def test_scales_given_as_numpy_numbers_become_numbers_in_the_record():
+def test_render_scales_given_as_numpy_numbers_become_python_numbers_in_the_record():
     wrong = of_slot("resolutions", "full", "scales", ((np.float32(0.5),), PluginState()))
     setup = setup_of({"resolution": wrong})
     scales = take_step(setup, first_state(setup)).scales
@@ -490,14 +490,14 @@ def test_an_invalid_number_format_of_a_metric_is_refused_before_the_run(monkeypa
     assert caught.value.found == repr(form)
 
 
-def test_any_number_of_group_labels_is_listed_in_the_objection():
+def test_group_labels_that_are_numbers_are_listed_in_the_objection():
     setup = setup_of({"sampler": build("samplers", "near-far", {})})
     names = {**setup.selection.names, "grouping": "odd"}
     selection = replace(setup.selection, names=names, labels=(0, 1, 2))
     assert "makes 3: 0, 1, 2" in " ".join(objections_to(selection))
 
 
-def test_groups_are_named_by_kind_for_any_block_names():
+def test_groups_of_blocks_are_named_by_their_kinds_for_any_block_names():
     rate = LearningRate(1.0)
     blocks = (
         Block("all", ("a",), True, "geometry", rate),
