@@ -120,7 +120,7 @@ def test_a_resumed_run_ends_with_the_bits_of_an_uninterrupted_run(varied, tmp_pa
     assert photos(tmp_path / "whole") == photos(tmp_path / "broken")
 
 
-def test_exposure_rates_fall_to_a_hundredth_and_rate_zero_keeps_initial_values(varied, tmp_path):
+def test_an_exposure_learning_rate_of_zero_keeps_the_initial_values(varied, tmp_path):
     kept = {"name": "gain", "rate": 0.0}
     assert run(varied, tmp_path / "one", steps=1, exposure=kept) == 0
     assert run(varied, tmp_path / "more", exposure=kept) == 0

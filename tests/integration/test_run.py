@@ -352,7 +352,7 @@ def test_a_run_with_a_time_budget_and_a_rewind_can_be_repeated(scene, tmp_path, 
     assert same(parameters(tmp_path / "timed"), parameters(tmp_path / "again"))
 
 
-def test_a_bad_value_right_before_a_length_revision_is_rewound(scene, tmp_path, monkeypatch):
+def test_a_non_finite_value_right_before_a_length_revision_is_rewound(scene, tmp_path, monkeypatch):
     poisoned(monkeypatch, Poison([7]))
     assert run(scene, tmp_path / "run", save_every=100, revisions=[[4, 12], [7, 12]]) == 0
     assert "training returned to step 4" in (tmp_path / "run" / "log.txt").read_text()

@@ -63,7 +63,7 @@ def test_the_number_of_levels_follows_from_the_distance_ratio(ratio, fork, level
     assert number_of_levels(5.0 * ratio, 5.0, fork) == levels
 
 
-def test_the_bounding_range_covers_all_axes_together():
+def test_the_bounding_range_is_one_interval_for_the_coordinates_of_all_axes():
     points = np.array([[-2.0, 0.0, 1.0], [0.5, 3.0, -1.0]])
     assert bounding_range(points) == pytest.approx((-2.2, 5.5))
     assert bounding_range(np.ones((4, 3)))[1] == 0.0
@@ -174,7 +174,7 @@ def test_float32_distinguishes_the_cells_of_the_finest_level(fork, reach):
     assert resolvable_levels(3, fork, 0.5, 0.0) == 3
 
 
-def test_the_automatic_visible_share_is_the_mean():
+def test_the_automatic_threshold_is_the_mean_of_the_visible_shares():
     shares = torch.tensor([1.0, 0.5, 0.0], dtype=torch.float64)
     assert visible_share(shares, -1.0) == 0.5
     assert visible_share(shares, 0.01) == 0.01

@@ -41,7 +41,7 @@ def test_the_interquartile_mean_of_few_values_is_correct(values, expected):
     assert iqm(np.array(values)) == pytest.approx(expected)
 
 
-def test_below_ten_pairs_the_test_is_students_t():
+def test_with_fewer_than_ten_pairs_verdicts_use_students_t_test():
     values = RNG.normal(0.1, 0.2, 7)
     found = estimate(values, ["a"] * 7, 0.1)
     peer = ttest_1samp(values, 0.0)
@@ -54,7 +54,7 @@ def test_below_ten_pairs_the_test_is_students_t():
     assert found.p_equivalent == pytest.approx(max(greater, less))
 
 
-def test_from_ten_pairs_on_the_interval_is_a_widened_bootstrap():
+def test_with_ten_or_more_pairs_verdicts_use_a_widened_bootstrap_interval():
     values = RNG.normal(0.1, 0.2, 16)
     found = estimate(values, ["a"] * 16, 0.1)
     assert found.method == IQM

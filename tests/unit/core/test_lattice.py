@@ -81,7 +81,7 @@ def test_level_0_is_always_visible_and_a_camera_inside_an_anchor_sees_every_leve
     assert not grid.detail(distances * 0, none).isnan().any()
 
 
-def test_visible_shares_count_the_cameras_that_see_an_anchor():
+def test_the_visible_share_of_an_anchor_is_the_share_of_cameras_that_see_it():
     rng = np.random.default_rng(2)
     anchors, levels = cloud(rng, 30)
     cameras = torch.from_numpy(rng.uniform(-6, 6, (7, 3)))

@@ -177,7 +177,7 @@ def test_the_opacity_cap_applies_after_the_filter_of_the_backbone():
     assert float(drawn.detach().max()) <= 0.8 + 1e-5
 
 
-def test_disabled_cap_and_full_pruning_agree_with_adc():
+def test_multiview_without_a_cap_and_with_full_pruning_prunes_like_adc():
     params = few([1e-4] * 4, [0.001, 0.002, 0.9, 0.5])
     state = planted([0] * 4, [0.0] * 4, [0.0] * 4)
     edit, _ = Planted(cap_opacity=1, prune_share=1).densify(context(params=params), state)

@@ -40,7 +40,7 @@ def test_intervals_contain_the_true_value_with_the_stated_coverage(kind, dimensi
     assert (held > 0.95 - SLACK).all()
 
 
-def test_intervals_are_not_too_wide():
+def test_confidence_intervals_are_not_too_wide():
     # An interval that held everything would pass the test above.
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(24, 300))
@@ -122,7 +122,7 @@ def ends(rows, near, **options):
 
 
 @pytest.mark.parametrize("scale", [1e-25, 1e25])
-def test_intervals_scale_with_the_squared_gradients(scale):
+def test_confidence_intervals_scale_with_the_squared_gradients(scale):
     rows, near = sample()
     expected = ends(rows, near) * np.array([[scale**2], [scale**2], [1.0]])
     np.testing.assert_allclose(ends(scale * rows, near), expected, rtol=1e-5)
@@ -139,7 +139,7 @@ def test_a_rotation_of_the_gradients_does_not_change_the_intervals():
     np.testing.assert_allclose(ends(rows @ rotation, near), ends(rows, near), rtol=1e-5)
 
 
-def test_intervals_contain_their_estimates():
+def test_confidence_intervals_contain_their_estimates():
     rows, near = sample()
     assert (ends(rows, near) == ends(rows, near)).all()
 

@@ -91,7 +91,7 @@ def test_photos_of_equal_exposure_do_not_differ_even_if_few_points_join_them(joi
     assert not judged(two_groups(joining, **errors, seed=seed)).differ
 
 
-def test_a_single_outlier_photo_does_not_decide():
+def test_a_single_outlier_photo_does_not_decide_that_exposures_differ():
     seen = two_groups(joining=1_000, outliers=0.0)
     off = seen.stops - 1.3 * (seen.photos == NEAR)
     gains = judged(replace(seen, stops=off))

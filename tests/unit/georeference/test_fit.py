@@ -30,7 +30,7 @@ def apart(found, expected, points):
 @settings(max_examples=40)
 @given(SEEDS, st.integers(3, 30), st.floats(0.0, 1.0))
 @example(582, 9, 0.0)  # All residuals were above their own median by rounding.
-def test_an_exact_similarity_is_found(seed, count, flat):
+def test_an_exact_similarity_transform_is_found(seed, count, flat):
     frame, points, measured, _ = case(seed, count, flat=flat)
     fit = fit_similarity(points, measured)
     if isinstance(fit, str):  # Three points may lie on a line.

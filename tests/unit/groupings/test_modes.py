@@ -97,7 +97,7 @@ def test_altitude_notes_are_empty_without_enough_evidence(heights):
     assert notes("altitude", at_heights(heights)) == ()
 
 
-def test_a_camera_without_a_value_is_ignored():
+def test_a_camera_without_a_value_is_ignored_by_the_test_for_modes():
     views = [*layout("city_unimodal").views]
     middle = np.mean([view.camera.center.numpy() for view in views], axis=0)
     scene = posed_scene([*views, posed_view(middle, "middle.png")])

@@ -111,7 +111,7 @@ def test_cagrad_gives_zero_if_a_combination_of_gradients_vanishes(ask):
 
 
 @pytest.mark.parametrize("name", ["mgda", "nash", "upgrad", "dualproj", "imtl-g"])
-def test_directions_that_cancel_give_zero(name, ask):
+def test_gradient_directions_that_cancel_give_a_zero_result(name, ask):
     angles = 2 * np.pi * np.arange(3) / 3
     rows = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     np.testing.assert_array_equal(ask(name, rows).result, [0, 0])

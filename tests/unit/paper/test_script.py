@@ -36,7 +36,7 @@ def test_a_scene_without_tuning_is_refused(modules):
         modules.paper.with_rates(bad, {"cagrad": "two random views"}, FACTORS)
 
 
-def test_backbones_use_the_methods_and_rates_of_similar_arms(modules):
+def test_backbones_are_combined_with_all_methods_and_use_rates_of_similar_arms(modules):
     plan = modules.data.read_plan()
     methods = [
         Arm(name="one view, 2x stretched", settings={"views": 1, "observers": ["diagnostics"]}),

@@ -112,7 +112,7 @@ def plan_for(scene, **given):
 
 
 @pytest.mark.parametrize("name", MEASURED)
-def test_the_decision_on_modes_matches_the_measured_scenes(name):
+def test_the_decision_on_distance_modes_matches_the_measured_scenes(name):
     choice, separability, ratio, spread, *_ = MEASURED[name]
     found = grouping.modes(evidence_of(name))
     assert found.choice == choice
@@ -215,7 +215,7 @@ def test_pairs_of_views_are_decided_by_the_whole_interval_of_rho(low, rho, high,
     assert not grouping.pairs(evidence_of("city_unimodal", probe)).settings
 
 
-def test_an_estimate_below_zero_without_an_interval_decides_nothing():
+def test_an_estimate_of_rho_below_zero_without_an_interval_decides_nothing():
     found = grouping.pairs(evidence_of("city_hybrid", Probe(rho=-0.0105, conflict=0.5)))
     assert (found.basis, dict(found.settings)) == ("default", {})
     assert "-0.011, 95 % interval none, the estimate is below 0" in found.evidence
@@ -336,7 +336,7 @@ def test_distances_with_a_gap_form_two_modes(share, views):
 
 @pytest.mark.parametrize("views", [10, 20, 30, 50, 100])
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_a_tenth_of_the_views_forms_a_mode_on_either_side(views, side):
+def test_a_tenth_of_the_views_is_enough_for_a_near_or_far_mode(views, side):
     far = np.arange(views) < views // 10
     found = modes_at(np.linspace(0.0, 0.1, views) + 2.0 * side * far)
     assert found.two
@@ -344,7 +344,7 @@ def test_a_tenth_of_the_views_forms_a_mode_on_either_side(views, side):
 
 
 @pytest.mark.parametrize("stragglers", [1, 2, 5])
-def test_a_few_outliers_do_not_form_a_mode(stragglers):
+def test_a_few_outlier_cameras_do_not_form_a_distance_mode(stragglers):
     logs = np.random.default_rng(5).normal(0.0, 0.1, 60)
     logs[:stragglers] += 3.0
     assert not modes_at(logs).two
@@ -421,7 +421,7 @@ def test_a_transparent_render_gets_the_background_of_its_photos():
     assert not plan_for(scene, background="black").settings
 
 
-def test_a_street_scene_has_one_mode():
+def test_a_scene_of_street_photos_has_one_distance_mode():
     plan = plan_for(street())
     assert plan.of_part("modes").choice == "one mode, continuous"
     assert plan.of_part("modes").figures["range"] > 3.0
@@ -447,7 +447,7 @@ def test_a_view_without_points_does_not_prevent_pairs():
     assert rule.labels(views) == ("near", "far") * 10
 
 
-def test_a_scene_of_street_and_aerial_photos_has_two_modes():
+def test_a_scene_of_street_and_aerial_photos_has_two_distance_modes():
     low = street(15)
     cloud = low.points
     high = [

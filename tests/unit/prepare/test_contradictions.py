@@ -53,7 +53,7 @@ def test_misplaced_photos_are_contradicted(made, count):
     assert all(votes[0] == 0 and votes[1] >= 30 * (PHOTOS - count) for votes in found.values())
 
 
-def test_a_single_other_photo_does_not_contradict_a_pose(made):
+def test_disagreement_with_a_single_photo_does_not_contradict_a_pose(made):
     """Which of two is wrong nobody can tell."""
     model, path = made
     one, *others = numbers(model)
@@ -63,7 +63,7 @@ def test_a_single_other_photo_does_not_contradict_a_pose(made):
     assert contradicted(model, path) == {}
 
 
-def test_few_matches_do_not_contradict_a_pose(made):
+def test_a_pair_with_few_matches_does_not_contradict_a_pose(made):
     model, path = made
     wrong = numbers(model)[0]
     misplace(model, wrong)

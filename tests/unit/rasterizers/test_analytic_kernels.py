@@ -45,7 +45,7 @@ def test_the_window_is_the_difference_of_the_distribution_function_across_a_pixe
 
 
 @pytest.mark.parametrize("opacity", [0.004, 0.02, 0.3, 1.0])
-def test_touched_pixels_are_within_the_radius(opacity):
+def test_pixels_touched_by_a_gaussian_are_within_its_radius(opacity):
     rng = np.random.default_rng(0)
     sigmas = np.exp(rng.uniform(np.log(1e-3), np.log(50), (40_000, 2)))
     offsets = rng.uniform(0, 1, (40_000, 2)) * (4 * sigmas + 1)

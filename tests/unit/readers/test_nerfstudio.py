@@ -162,7 +162,7 @@ def test_masks_named_by_frames_are_used(tmp_path):
         ({"train": (1,), "val": (0,), "test": (2,)}, ["c.png"]),
     ],
 )
-def test_lists_in_the_file_define_the_split(lists, held_out, tmp_path):
+def test_split_lists_in_the_transforms_file_define_the_split(lists, held_out, tmp_path):
     names = {
         f"{part}_filenames": [f"./images/{NAMES[i]}" for i in rows] for part, rows in lists.items()
     }
@@ -236,7 +236,7 @@ def test_an_ignored_crop_is_reported(tmp_path):
 
 
 @pytest.mark.parametrize(("named", "stored"), [("a", "a.png"), ("a.b", "a.b.png"), ("a", "a")])
-def test_names_without_a_suffix_refer_to_png_files(named, stored, tmp_path):
+def test_photo_names_without_a_suffix_refer_to_png_files(named, stored, tmp_path):
     path = write(tmp_path, **LENS)
     (path / "images" / "a.png").rename(path / "images" / stored)
     whole = json.loads((path / "transforms.json").read_text())

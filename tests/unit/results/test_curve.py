@@ -76,7 +76,7 @@ def test_rendered_views_are_marked_at_the_time_they_were_reached(tmp_path: Path,
     assert ticks["800"] == pytest.approx(6.0)
 
 
-def test_one_regime_is_not_drawn_twice(tmp_path: Path, figures):
+def test_the_curve_of_a_single_regime_is_not_drawn_twice(tmp_path: Path, figures):
     draw_curve(tmp_path, make_rows(3, ("far",)), "title", {"far": 1})
     assert len(figures[0].axes[0].get_lines()) == 1
 

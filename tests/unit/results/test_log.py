@@ -26,7 +26,7 @@ def test_the_progress_line_shows_loss_steps_per_second_and_remaining_time():
     )
 
 
-def test_the_loss_is_smoothed():
+def test_the_progress_line_shows_a_smoothed_loss():
     pace = Pace(total=10).after(record(1, (1.0,)))
     assert pace.loss == 1.0
     assert pace.after(record(2, (0.0,))).loss == pytest.approx(0.95)

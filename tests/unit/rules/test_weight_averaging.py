@@ -130,7 +130,7 @@ def test_learning_rates_equal_the_published_rates_until_they_decay(runs):
     assert constant and all(published[0][n] == published[-1][n] for n in constant)
 
 
-def test_the_average_covers_the_last_steps_and_does_not_change_training(runs):
+def test_the_average_of_parameters_covers_the_last_steps_and_does_not_change_training(runs):
     (plain, _, _), (state, seen, _) = runs.plain, runs.averaged
     assert same(plain.parameters, state.parameters)
     assert NAME not in plain.states

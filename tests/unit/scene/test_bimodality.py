@@ -46,7 +46,7 @@ def test_known_distributions_have_the_expected_coefficients(values, expected):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_both_coefficients_are_computed_from_standard_moments(seed):
+def test_both_bimodality_coefficients_are_computed_from_standard_moments(seed):
     values = np.random.default_rng(seed).gamma(2.0, size=23)
     n = len(values)
     g1, g2 = skew(values, bias=False), kurtosis(values, bias=False)
@@ -57,7 +57,7 @@ def test_both_coefficients_are_computed_from_standard_moments(seed):
 
 
 @pytest.mark.parametrize(("scale", "shift"), [(1e-150, 0.0), (1e150, 0.0), (-3.0, 1e6)])
-def test_units_do_not_change_the_coefficient(scale, shift):
+def test_the_unit_of_the_values_does_not_change_the_bimodality_coefficient(scale, shift):
     values = np.random.default_rng(0).normal(size=40)
     found, moved = bimodality(values), bimodality(scale * values + shift)
     assert moved.sample == pytest.approx(found.sample, rel=1e-6)
@@ -73,7 +73,7 @@ def test_units_do_not_change_the_coefficient(scale, shift):
         pytest.param([0.0] * 5, "equal", id="zero"),
     ],
 )
-def test_values_without_a_coefficient_give_the_reason(values, reason):
+def test_values_without_a_bimodality_coefficient_give_the_reason(values, reason):
     found = bimodality(np.array(values))
     assert np.isnan([found.sample, found.population]).all()
     assert reason in found.reason

@@ -73,7 +73,7 @@ def causes(verdict):
 
 
 @pytest.mark.parametrize("tracks", [True, False])
-def test_a_correct_scene_agrees(model, tracks):
+def test_the_self_check_of_a_correct_scene_reports_no_contradiction(model, tracks):
     verdict = found(model if tracks else without_tracks(model))
     assert not causes(verdict)
     assert verdict.correlation > 0.8
@@ -233,7 +233,7 @@ def test_evenly_spread_photos_of_a_very_large_scene_are_checked(model):
     assert 0 < few.check["compared"] < len(scene.views)
 
 
-def test_equal_poses_equal_photos_and_points_at_infinity_are_noted(model):
+def test_the_self_check_notes_equal_poses_equal_photos_and_points_at_infinity(model):
     rotations, centers = model.rotations.copy(), model.centers
     rotations[2], centers[2] = rotations[1], centers[1]
     photos = list(model.photos)
@@ -250,7 +250,7 @@ def test_equal_poses_equal_photos_and_points_at_infinity_are_noted(model):
     assert "1 point extremely far away" in notes
 
 
-def test_dark_and_blurred_photos_are_noted(model):
+def test_the_self_check_notes_dark_and_blurred_photos(model):
     photos = list(model.photos)
     photos[3] = (photos[3] // 60).astype(np.uint8)
     height, width = photos[5].shape[:2]

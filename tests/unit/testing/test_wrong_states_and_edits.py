@@ -114,7 +114,7 @@ def test_randomly_drawn_weights_are_not_compared():
         operators.views_that_are_alike_count_alike(AtRandom)
 
 
-def test_a_window_over_the_last_steps_is_bounded():
+def test_a_state_that_covers_a_window_of_the_last_steps_counts_as_bounded():
     growth.require_bounded((min(step, 900) for step in range(10_000)), "sample")
 
 

@@ -381,7 +381,7 @@ def test_invalid_budgets_are_refused(text):
         RunConfig(max_gaussians=text)
 
 
-def test_no_growth_is_allowed_between_edits():
+def test_no_growth_is_allowed_after_the_end_of_density_control():
     setup = setup_of("adc")
     schedule = replace(setup.schedule, densify_until=2)
     state = SimpleNamespace(step=5)

@@ -128,7 +128,7 @@ def test_a_third_party_operator_is_evaluated_once_for_each_number_of_views():
     assert [len(context.losses) for context in Fivefold.asked] == [2, 3]
 
 
-def test_the_probe_of_an_operator_distinguishes_views_only_by_labels():
+def test_views_differ_only_by_labels_when_the_scale_of_an_operator_is_measured():
     Fivefold.asked.clear()
     context = aggregate_context(sample_gradients(3))
     OperatorScale(Fivefold()).of(replace(context, scales=(1.0, 0.5, 0.25)))

@@ -36,7 +36,7 @@ def random_parameters(count, seed=0):
     return {"means": means, "codes": torch.arange(float(count)), "shared": torch.ones(2)}
 
 
-def test_rows_are_in_morton_order():
+def test_primitives_are_sorted_in_morton_order():
     positions = torch.cat([torch.randn(500, 3), torch.randn(50, 3) * 1e3, torch.zeros(2, 3)])
     rows = along_curve(positions)
     assert rows.tolist() == sorted(range(552), key=lambda i: (code(positions[i].tolist()), i))
@@ -98,7 +98,7 @@ def test_a_step_with_an_edit_reorders_all_rows_together(backbone, monkeypatch):
     assert torch.equal(state.moments.exp_avg_sq[name][:, 2], found)
 
 
-def test_a_run_is_in_order_after_each_of_its_edits():
+def test_gaussians_are_in_morton_order_after_each_edit_of_a_run():
     given = {"steps": 60, "densify_from": 5, "densify_every": 5, "densify_until": 50}
     setup = assemble(
         RunConfig.model_validate({**given, "schedule_unit": "steps"}), sample_scene(), "none"

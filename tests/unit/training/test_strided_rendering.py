@@ -95,7 +95,7 @@ def test_every_pixel_corner_is_used_about_equally_for_any_sampler_period(stride)
 @pytest.mark.parametrize(
     ("scale", "stride"), [(1.0, 1), (0.5, 2), (1 / 3, 3), (0.25, 4), (0.6, 1), (0.45, 1), (0.2, 5)]
 )
-def test_strides_exist_for_scales_of_whole_number_ratios_only(scale, stride):
+def test_strides_exist_only_for_render_scales_that_divide_the_size_by_a_whole_number(scale, stride):
     assert stride_of(scale, posed_camera()) == stride
 
 

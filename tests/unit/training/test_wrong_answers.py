@@ -79,7 +79,7 @@ def test_a_result_without_its_state_is_reported_with_the_method(word, slot, name
 
 
 @pytest.mark.parametrize("answer", [None, (1, 2)])
-def test_decode_must_return_gaussians(answer):
+def test_the_method_decode_must_return_gaussians(answer):
     error = refused(setup_of({"backbone": of_slot("backbones", "vanilla", "decode", answer)}))
     assert "Wrong.decode returned a value of a wrong type" in error.what
     assert error.expected == "Gaussians"
@@ -99,7 +99,7 @@ def test_backbones_must_create_exactly_the_tensors_of_their_blocks(answer):
     assert error.found == (", ".join(n for n, t in answer.items() if t is not None) or "none")
 
 
-def test_prepare_must_return_all_tensors_of_the_blocks():
+def test_the_method_prepare_must_return_all_tensors_of_the_blocks():
     backbone = of_slot("backbones", "vanilla", "prepare", {"means": torch.zeros(3, 3)})
     error = refused(setup_of({"backbone": backbone}))
     assert "Wrong.prepare returned tensors with other names" in error.what
@@ -121,7 +121,7 @@ def test_tensors_that_a_backbone_prepares_need_not_be_created():
 
 
 @pytest.mark.parametrize("answer", [3, ()])
-def test_more_points_must_return_points(answer):
+def test_the_method_more_points_must_return_points(answer):
     error = refused(
         setup_of({"initializer": of_slot("initializers", "points", "more_points", answer)})
     )
@@ -139,7 +139,9 @@ def test_more_points_must_return_points(answer):
         ),
     ],
 )
-def test_fitted_to_must_return_a_component_of_its_slot(monkeypatch, base, slot, name, answer):
+def test_the_method_fitted_to_must_return_a_component_of_its_slot(
+    monkeypatch, base, slot, name, answer
+):
     original, wrong = selecting.chosen, of_slot(slot, name, "fitted_to", answer)
 
     def built(kind, choice):
