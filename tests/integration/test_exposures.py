@@ -148,7 +148,7 @@ def test_exposure_from_starts_at_the_values_of_another_run(varied, tmp_path):
 def test_photos_missing_from_the_file_keep_their_exposure_relative_to_other_photos(
     varied, tmp_path, model
 ):
-    """The file has three photos, each three stops brighter than in the run before."""
+    """The file contains three photos, each three stops brighter than in the earlier run."""
     kind = "matrix" if model == "affine" else "stops"
 
     def levels(values):

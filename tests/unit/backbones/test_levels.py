@@ -143,7 +143,7 @@ def test_one_point_has_anchors_on_finer_levels_only_with_plant_everywhere(everyw
     ("x", "wanted"), [((0.1, 0.2), [0, 1, 1]), ((0.01, 0.05), [0, 3, 3]), ((0.1, 0.1), [0])]
 )
 def test_levels_that_separate_no_points_get_no_anchors(x, wanted):
-    """Cells of 1/2, 1/4, 1/8 and 1/16 around 0."""
+    """The cells have sizes 1/2, 1/4, 1/8 and 1/16 around the origin."""
     points = np.array([[each, 0.0, 0.0] for each in x])
     assert init_anchors(points, lattice(4), everywhere=False).levels.tolist() == wanted
 

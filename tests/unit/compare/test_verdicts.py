@@ -206,7 +206,7 @@ def test_more_than_five_comparisons_are_corrected():
     ],
 )
 def test_scenes_that_contradict_a_verdict_are_reported(levels, verdict, contradicting):
-    """The interquartile mean leaves a scene out that is unlike the others."""
+    """The interquartile mean leaves out a scene whose values are far from the other scenes."""
     scenes = [f"s{number}" for number in range(4) for _ in range(3)]
     values = np.repeat(levels, 3) + np.tile([-0.02, 0.0, 0.02], 4)
     found = estimate(values, scenes, 0.1)

@@ -98,7 +98,7 @@ def test_small_gaussians_are_cloned_large_ones_are_split_and_statistics_reset():
 
 
 def test_children_of_a_split_are_sampled_from_their_parent():
-    """mean + R (s n) with n standard normal, on a turned and stretched parent."""
+    """A child is at mean + R (s n) with n standard normal. The parent is rotated and stretched."""
     rng = np.random.default_rng(5)
     params = parameters()
     with torch.no_grad():
@@ -150,7 +150,7 @@ def test_a_reset_caps_opacities_and_clears_their_moments():
 
 
 def test_a_reset_with_an_edit_caps_the_opacity_rendered_after_the_edit():
-    """The filter of backbone mip depends on where the children are."""
+    """The filter of backbone mip depends on the positions of the children."""
     backbone = MipSplatting()
     rng = np.random.default_rng(0)
     params = backbone.create(sample_scene(), rng)

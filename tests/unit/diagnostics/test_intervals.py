@@ -82,7 +82,7 @@ def test_coverage_of_the_hard_cases_is_within_the_accepted_range(
 
 @pytest.mark.parametrize("isotropic", [True, False])
 def test_the_variance_assumed_at_the_true_gap_agrees_with_normal_theory(isotropic):
-    """The variance that the pivot assumes at the true gap, on average, against that of normals."""
+    """Compare the mean variance that the pivot assumes at the true gap with normal theory."""
     rng = np.random.default_rng(1)
     scales = np.ones(30) if isotropic else 1.0 / np.sqrt(1.0 + np.arange(30))
     # The gap lies where gradients vary least.
@@ -163,7 +163,7 @@ def test_only_a_wide_gap_between_groups_has_an_interval_above_zero():
 
 
 def test_an_estimate_far_below_zero_has_no_interval():
-    """Groups with the same views, whose means lie nearer than those of any two samples."""
+    """Both groups contain the same views, so their means are equal."""
     rows = np.tile(np.random.default_rng(0).normal(size=(12, 300)), (2, 1))
     gramian, groups = rows @ rows.T, Groups(np.arange(24) < 12)
     found = split_intervals(gramian, groups, np.random.default_rng(0))

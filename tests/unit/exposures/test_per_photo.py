@@ -72,7 +72,7 @@ def test_projection_to_a_neutral_mean_keeps_exposure_differences_between_photos(
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**16))
 def test_projection_of_affine_maps_keeps_their_relative_maps(seed):
-    """Of general maps, too: A_i composed with the inverse of A_j is what it was."""
+    """A_i composed with the inverse of A_j does not change, even for general affine maps."""
     noise = torch.randn(5, 3, 4, generator=torch.Generator().manual_seed(seed)).double()
     values = Affine().neutral() + 0.1 * noise
     found = Affine().project({"matrix": values})["matrix"].double()

@@ -75,7 +75,7 @@ def test_outliers_are_left_out_of_the_fit(seed, count):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_nearly_half_of_the_points_may_be_wrong_even_in_the_same_direction(seed):
-    """As photos of one folder whose receiver stood elsewhere."""
+    """An example is one folder of photos whose GPS receiver had a constant offset."""
     _, points, measured, rng = case(seed, 60, noise=0.01)
     frame = case(seed, 60)[0]
     wrong = rng.permutation(60)[:26]

@@ -46,7 +46,7 @@ def test_gradients_without_conflict_are_added(name, ask):
 
 
 def test_cagrad_solves_its_optimisation_problem_in_the_plane(ask):
-    """max over |d - g0| <= c |g0| of min g_k.d, against a fine grid of directions."""
+    """Compare max over |d - g0| <= c |g0| of min g_k.d with a fine grid of directions."""
     pairs = (PAIR, np.array([[3.0, 1.0], [-1.0, 2.0]]), np.array([[1.0, 0.0], [-0.9, 0.1]]))
     for rows in pairs:
         mean = rows.mean(axis=0)

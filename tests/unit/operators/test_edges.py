@@ -105,7 +105,7 @@ def test_aligned_drops_a_view_shorter_than_the_threshold(ask):
 
 
 def test_cagrad_gives_zero_if_a_combination_of_gradients_vanishes(ask):
-    """Three directions of one plane that cancel: g_w = 0, the direction is undefined."""
+    """Three gradients in one plane cancel: g_w = 0, so the direction is undefined."""
     rows = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0]])
     np.testing.assert_array_equal(ask("cagrad", rows).result, [0, 0])
 

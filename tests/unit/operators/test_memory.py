@@ -58,7 +58,7 @@ def test_confgate_does_not_project_a_rare_conflict(ask):
 
 
 def test_confgate_low_detects_conflict_sooner_than_v2(ask):
-    """Cosines of about -1 and +1, a few more of the former: P(conflict) wanders around 0.8."""
+    """Cosines are about -1 and +1, and slightly more are -1. P(conflict) stays around 0.8."""
     signs = np.where(np.random.default_rng(0).random(600) < 0.54, -1.0, 1.0)
     gates = {}
     for preset in ("v2", "low"):

@@ -38,7 +38,7 @@ def test_integer_gradients_give_exact_results(name):
 
 
 def test_upgrad_of_nearly_opposite_gradients_does_not_jump_to_zero(ask):
-    """A third gradient keeps a part that conflicts with neither of two almost opposite ones."""
+    """A part of a third gradient conflicts with neither of two almost opposite gradients."""
     lengths = []
     for distance in (1e-4, 1e-5, 3e-6):
         rows = [[1.0, 0.0, 0.0], [-1.0, distance, 0.0], [0.3, -0.9, 0.3]]
@@ -72,6 +72,6 @@ def test_nearly_cancelling_gradients_give_no_wrong_result(name, dtype):
 
 
 def test_cagrad_gives_zero_if_two_short_gradients_cancel(ask):
-    """CAGrad between others and two short ones: no level above 0 can be reached by all."""
+    """Two short gradients cancel, so no direction has a positive product with all gradients."""
     rows = np.array([[0.5, 1, 2], [0.2, 4, 1], [0.3, 2, 5], [1e-3, 0, 0], [-1e-3, 0, 0]])
     assert not ask("cagrad", rows).result.any()

@@ -43,7 +43,7 @@ def test_correct_poses_are_not_contradicted(made):
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_misplaced_photos_are_contradicted(made, count):
-    """Each has its matches with the others against it; what was found before has no vote."""
+    """The matches of a misplaced photo with all other photos contradict its pose."""
     model, path = made
     wrong = numbers(model)[:count]
     for at, number in enumerate(wrong):
@@ -54,7 +54,7 @@ def test_misplaced_photos_are_contradicted(made, count):
 
 
 def test_disagreement_with_a_single_photo_does_not_contradict_a_pose(made):
-    """Which of two is wrong nobody can tell."""
+    """With only two photos, it is unknown which pose is wrong."""
     model, path = made
     one, *others = numbers(model)
     for number in others[1:]:

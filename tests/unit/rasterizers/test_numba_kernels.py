@@ -281,7 +281,7 @@ def test_requesting_optional_outputs_changes_no_gradient():
 @pytest.mark.parametrize("response", ["plain", "antialiased", "analytic"])
 @pytest.mark.parametrize("count", [1, 40, 5000])
 def test_reused_memory_changes_no_gradient(monkeypatch, count, response):
-    """Of Gaussians that are drawn and of those beside the image."""
+    """Test rendered Gaussians and Gaussians outside the image."""
     size, view = (40, 24), camera(40, 24)
     gaussians = cloud(count, size)
     gaussians.means[::2, 0] += 1000.0

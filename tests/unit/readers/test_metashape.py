@@ -74,7 +74,7 @@ def test_points_of_the_other_frame_are_refused_with_the_option(path):
 
 
 def test_a_georeferenced_chunk_is_converted_to_the_local_frame(path):
-    """Moved to Berlin by an independent way, the scene comes back as it was: east, north, up."""
+    """Move the scene to Berlin by an independent computation. The reader must undo the move."""
     guard_pycolmap()
     import pycolmap
 
@@ -134,7 +134,7 @@ def test_a_disabled_camera_is_left_out(path):
     ],
 )
 def test_a_compensated_rolling_shutter_is_refused_with_a_remedy(told, path):
-    """Its poses are those of one row of each photo, the others have other ones."""
+    """The poses belong to one row of each photo. Other rows have other poses."""
     edit(path, r"(<sensor [^>]*>)", rf"\1{told}")
     with pytest.raises(metashape.UserError, match="rolling shutter") as caught:
         read(path)

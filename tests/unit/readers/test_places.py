@@ -311,7 +311,7 @@ def edit(path, *lines):
 
 
 def test_pose_priors_that_refer_to_each_other_many_times_are_read_once(tmp_path):
-    """Joined they would be 4 * 10^8."""
+    """A join would return 4 * 10^8 rows."""
     path = tmp_path / "database.db"
     blob = struct.pack("<3d", 52.0, 13.0, 30.0).hex()
     count = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < 20000)"

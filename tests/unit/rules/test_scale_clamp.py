@@ -120,7 +120,7 @@ def test_non_finite_and_small_scales_are_not_clamped():
 
 
 def test_scales_below_the_bound_are_not_clamped():
-    """No Gaussian is large, or all are large and far away."""
+    """Either no Gaussian is large, or all Gaussians are large and far away."""
     setup = setup_of()
     state = at_random(setup, 0)
     scales = state.parameters["scales"].detach()
@@ -151,7 +151,7 @@ def test_scales_are_clamped_at_fixed_intervals_only():
 
 @pytest.mark.parametrize("backbone", AXES)
 def test_a_step_clamps_only_scales_above_the_bound(backbone):
-    """Adam's moments stay, and all that is not too long has the bits of a step without a bound."""
+    """The moments of Adam do not change. Other values have the bits of a step without a bound."""
     found = {}
     for bound in (None, 0.0):
         setup = setup_of(backbone, rules=using(bound), initializer={"name": "points"})

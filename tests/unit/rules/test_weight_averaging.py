@@ -260,7 +260,7 @@ def test_a_longer_length_discards_an_average_that_began_too_early():
     ids=["fewer", "other-order", "reset", "nothing", "a-count"],
 )
 def test_an_edit_of_density_control_restarts_the_average(edit, count, monkeypatch):
-    """Of ten steps the last six are averaged, and the edit comes in the eighth."""
+    """The last six of ten steps are averaged, and the edit happens in step 8."""
     setup = setup_of(**using(NAME, share=0.6))
 
     def densify(self, context, state):

@@ -133,7 +133,7 @@ def test_a_photo_of_200_megapixels_is_decoded_in_little_memory(tmp_path):
 
 
 def test_a_decompression_bomb_is_refused_before_memory_is_allocated(tmp_path):
-    """400 megapixels of black in 49 kB."""
+    """The file has 49 kB and contains 400 megapixels of black."""
     width = height = 20_000
     header = b"IHDR" + width.to_bytes(4, "big") + height.to_bytes(4, "big") + b"\1\0\0\0\0"
     pixels = b"IDAT" + zlib.compress(bytes((width // 8 + 1) * height), 9)

@@ -131,7 +131,7 @@ def test_a_non_finite_gaussian_does_not_affect_other_gaussians():
 @pytest.mark.parametrize("kind", [torch.float32, torch.float64])
 @pytest.mark.parametrize("seed", range(20))
 def test_the_typical_size_is_the_median_of_the_finite_middle_axes_of_gaussians(seed, kind):
-    """NaN counts as longer than all."""
+    """In the order of axes, NaN counts as the longest length."""
     rng = np.random.default_rng(seed)
     scales = rng.normal(size=(rng.integers(1, 40), 3))
     odd = rng.random(scales.shape) < rng.choice([0.1, 0.6])

@@ -46,7 +46,7 @@ def test_primitives_are_sorted_in_morton_order():
     ("far", "place"), [(torch.nan, 0), (-torch.inf, 0), (torch.inf, 2), (1e38, 2)]
 )
 def test_positions_without_a_cell_are_sorted_to_the_start_or_the_end(far, place):
-    """Where x is not a number or left of all cells it counts as the first cell, else the last."""
+    """A position is first if x is NaN or below all cells, and last if x is above all cells."""
     positions = torch.tensor([[0.0, 0.0, 0.0], [far, 0.0, 0.0], [1.0, 0.0, 0.0]])
     assert along_curve(positions).tolist().index(1) == place
 
@@ -76,7 +76,7 @@ def test_parameters_without_a_tensor_of_positions_are_not_reordered(name):
 
 @pytest.mark.parametrize("backbone", ["vanilla", "mip", "scaffold", "octree"])
 def test_a_step_with_an_edit_reorders_all_rows_together(backbone, monkeypatch):
-    """An edit that turns all around: moments and a plugin's rows stay with their primitives."""
+    """The edit reverses the order. Moments and plugin rows stay with their primitives."""
     config = RunConfig.model_validate({"steps": 10, "backbone": {"name": backbone}})
     setup = assemble(config, sample_scene(), "none")
     state = first_state(setup)
