@@ -114,7 +114,7 @@ def test_a_non_finite_gradient_makes_gpu_parameters_non_finite(bad):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_memory_of_moments_marked_as_zero_is_not_read(dtype):
-    """In the second half, all gradients are zero."""
+    """All gradients in the second half of the tensor are zero."""
     grad = torch.cat([tensors(6)["means"].flatten(), torch.zeros(70_000)]).to(dtype)
     found = []
     for first, names in ((0.0, ()), (torch.nan, {"x"})):
@@ -230,7 +230,7 @@ def test_invalid_arguments_are_refused(grad, options):
 
 @pytest.mark.parametrize("last", ["grad", "exp_avg", "exp_avg_sq"])
 def test_only_elements_with_nonzero_gradient_or_moments_change(last):
-    """Test every position of the first and last nonzero number, because runs of zeros are skipped."""
+    """Test every position of the first and last nonzero number. Runs of zeros are skipped."""
     size = 3 * 2**13 + 5
     rule = coefficients()
     for at in (0, 63, 64, 2**13 - 1, 2**13, 2 * 2**13 + 64, size - 1):

@@ -108,7 +108,7 @@ def test_without_a_fitted_line_the_exponent_is_nan(squared, distances):
     assert np.isnan([found.value, found.interval.low, found.interval.high]).all()
 
 
-def test_zero_gradients_and_zero_distances_are_left_out():
+def test_the_exponent_fit_leaves_out_zero_gradients_and_zero_distances():
     distances = np.array([0.0, 1.0, 2.0, 4.0, 8.0, 16.0])
     squared = np.array([5.0, 1.0, 0.25, 0.0625, 0.015625, 0.0])
     found = distance_exponent(squared, distances)

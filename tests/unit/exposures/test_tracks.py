@@ -244,7 +244,7 @@ def test_gains_of_a_scene_are_computed_once_and_released_with_the_scene():
     assert gone() is None
 
 
-def test_auto_selects_a_gain_if_the_rule_requires_it_and_reports_the_reason():
+def test_exposure_auto_selects_a_gain_by_the_rule_and_reports_the_reason():
     fitted_on = Auto().fitted_to(grey_scene([0.1, 0.2, 0.4]))
     assert fitted_on.name == "gain"
     off = Auto().fitted_to(grey_scene([0.2, 0.2, 0.2]))

@@ -72,7 +72,9 @@ def paper(modules, tmp_path):
     return make
 
 
-def test_the_estimate_subtracts_runs_in_packed_tables(paper, planted, modules, capsys):
+def test_the_estimated_time_excludes_finished_runs_in_packed_tables(
+    paper, planted, modules, capsys
+):
     scenes = [f"/scenes/{name}" for name in SCENES[:2]]
     found = paper(scene=scenes, only=["views"])
 

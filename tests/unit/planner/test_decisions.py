@@ -179,7 +179,7 @@ def test_settings_of_the_user_are_kept_and_marked_in_the_table(bundled):
     assert planned(mine, scene) == []
 
 
-def test_decisions_become_settings(bundled):
+def test_decisions_of_the_planner_become_settings(bundled):
     config, scene = bundled
     (row,) = planned(config, scene)
     assert (row.setting, row.value, row.override) == ("exposure", "gain", "--exposure none")
@@ -282,7 +282,7 @@ def test_pairs_from_modes_of_unequal_size_are_rejected_because_they_change_the_o
         ({"sampler": {"name": "near-far"}, "backward": "joint"}, "sum"),
     ],
 )
-def test_projection_is_chosen_for_pairs_from_the_sampler_of_the_user(given, choice):
+def test_gradient_projection_is_chosen_for_pairs_from_the_sampler_of_the_user(given, choice):
     assert grouping.operator(evidence_of("city_hybrid", PAIRS_PAY, **given)).choice == choice
 
 
@@ -302,14 +302,14 @@ def test_the_gradient_probe_uses_the_grouping_of_the_run(given, grouping):
 @pytest.mark.parametrize(
     ("name", "grouping"), [("city_hybrid", "altitude"), ("ochota_kap_hybrid", "footprint")]
 )
-def test_modes_are_separated_by_the_grouping_with_the_clearest_gap(name, grouping):
+def test_distance_modes_are_separated_by_the_grouping_with_the_clearest_gap(name, grouping):
     assert evidence_of(name).grouping.name == grouping
 
 
 @pytest.mark.sampled(5)
 @pytest.mark.parametrize("views", [12, 30, 60, 200])
 @pytest.mark.parametrize("law", ["uniform", "normal", "exponential", "lognormal"])
-def test_distances_without_a_gap_form_one_mode(law, views):
+def test_camera_distances_without_a_gap_form_one_mode(law, views):
     rng = np.random.default_rng(views)
     draw = {
         "uniform": lambda: rng.uniform(0.0, 2.5, views),
@@ -324,7 +324,7 @@ def test_distances_without_a_gap_form_one_mode(law, views):
 
 @pytest.mark.parametrize("views", [12, 30, 60, 200])
 @pytest.mark.parametrize("share", [0.2, 0.5])
-def test_distances_with_a_gap_form_two_modes(share, views):
+def test_camera_distances_with_a_gap_form_two_modes(share, views):
     rng = np.random.default_rng(views)
     far = np.arange(views) < round(share * views)
     found = [modes_at(rng.normal(0.0, 0.07, views) + far) for _ in range(100)]
@@ -355,7 +355,9 @@ def test_a_few_outlier_cameras_do_not_form_a_distance_mode(stragglers):
     ("conflict_low", "rho_low", "choice"),
     [(0.6, 0.2, "symmetric"), (0.45, 0.2, "sum"), (0.6, 0.0, "sum")],
 )
-def test_projection_requires_pairs_and_conflict_beyond_chance(conflict_low, rho_low, choice):
+def test_gradient_projection_requires_pairs_and_conflict_beyond_chance(
+    conflict_low, rho_low, choice
+):
     probe = Probe(rho=0.5, rho_low=rho_low, rho_high=0.9, conflict=0.7, conflict_low=conflict_low)
     assert grouping.operator(evidence_of("city_hybrid", probe)).choice == choice
     assert grouping.operator(evidence_of("city_unimodal", probe)).choice == "sum"
@@ -413,7 +415,7 @@ def test_a_scene_with_cameras_in_an_orbit_has_one_distance():
     assert not plan.settings
 
 
-def test_a_transparent_render_gets_the_background_of_its_photos():
+def test_the_planner_selects_the_background_with_which_photos_were_blended():
     note = "photos: 40 of 40 photos with transparency: blended over RGB (1.0, 1.0, 1.0)"
     scene = replace(orbit(), notes=(note,))
     assert plan_for(scene).settings == {"background": "white"}
@@ -429,7 +431,7 @@ def test_a_scene_of_street_photos_has_one_distance_mode():
     assert not plan.settings
 
 
-def test_a_view_without_points_does_not_prevent_pairs():
+def test_a_view_without_points_does_not_prevent_pairs_of_views():
     rng = np.random.default_rng(1)
     cloud = rng.uniform(-1.0, 1.0, (200, 3))
     views = [
@@ -604,6 +606,8 @@ def test_the_planner_handles_random_scenes(centers, points, asked, notes):
         (data.held_out, "test_every", 4),
     ],
 )
-def test_data_settings_of_the_user_are_not_decided(decides, setting, value):
+def test_settings_in_the_group_data_given_by_the_user_are_not_changed_by_the_planner(
+    decides, setting, value
+):
     evidence = Evidence(config_of(data={setting: value}), posed_scene([]))
     assert decides(evidence).basis == "given"

@@ -61,7 +61,7 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("form", CHANGES)
-def test_the_table_is_read_in_all_saved_forms(form, scene):
+def test_a_realitycapture_table_is_read_in_all_forms_in_which_it_may_be_saved(form, scene):
     (file,) = scene.glob("*.csv")
     before, _ = read(scene)
     changed = CHANGES[form](file.read_text())

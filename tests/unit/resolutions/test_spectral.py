@@ -305,7 +305,7 @@ def test_a_size_of_octaves_may_be_omitted(options, text):
     assert told == f"resolution: {text}; no side has fewer than 96 pixels"
 
 
-def test_sizes_out_of_order_are_refused():
+def test_render_sizes_of_octaves_that_are_out_of_order_are_refused():
     with pytest.raises(UserError, match="half_until must be at least"):
         build("resolutions", "octaves", {"quarter_until": 0.5, "half_until": 0.3})
 

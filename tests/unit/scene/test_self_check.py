@@ -80,7 +80,7 @@ def test_the_self_check_of_a_correct_scene_reports_no_contradiction(model, track
     assert verdict.compared == 16
 
 
-def test_the_search_covers_all_kinds_of_contradictions(contradictions):
+def test_the_self_check_is_tested_with_all_kinds_of_contradictions(contradictions):
     assert tuple(contradictions.KINDS) == KINDS
 
 
@@ -102,7 +102,7 @@ def test_each_kind_of_contradiction_is_reported_with_cause_or_photos(
 
 
 @pytest.mark.parametrize("kind", ["OpenGL axes", "camera-to-world poses", "scaled points"])
-def test_the_cause_is_found_without_tracks(contradictions, model, kind):
+def test_the_cause_of_a_contradiction_is_found_without_tracks(contradictions, model, kind):
     wrong = contradictions.KINDS[kind](without_tracks(model), np.random.default_rng(0))
     assert any(word in cause for word in wrong.causes for cause in causes(found(wrong.model)))
 
@@ -118,7 +118,7 @@ def test_a_rotated_camera_without_tracks_is_named(model, axis):
     assert cause.views == (5,)
 
 
-def test_the_cause_is_found_if_the_colours_of_the_points_are_noisy(contradictions, model):
+def test_the_cause_of_a_contradiction_is_found_if_point_colours_are_noisy(contradictions, model):
     noise = np.random.default_rng(0).normal(0.0, 130.0, model.colors.shape)
     colors = np.clip(model.colors + noise, 0, 255).astype(np.uint8)
     right = replace(without_tracks(model), colors=colors)
