@@ -61,7 +61,7 @@ def test_a_split_of_two_modes_of_distances_is_not_noted(grouping):
     assert notes(grouping, layout("city_hybrid")) == ()
 
 
-def test_modes_of_heights_are_tested_along_the_axis_that_splits_them():
+def test_modes_of_heights_are_tested_along_the_axis_of_the_grouping():
     one = at_heights(np.random.default_rng(0).normal(size=40))
     (note,) = notes("altitude", one)
     assert "the bimodality of the height is 0." in note

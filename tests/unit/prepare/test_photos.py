@@ -350,7 +350,7 @@ def test_a_photo_that_is_too_large_gives_one_error_with_its_name(
     assert name not in decoded
 
 
-def test_one_of_two_identical_files_is_used(tmp_path):
+def test_only_one_of_two_identical_photo_files_is_used(tmp_path):
     for name in ("b.jpg", "c.jpg"):
         save(tmp_path / name)
     shutil.copy(tmp_path / "b.jpg", tmp_path / "a.jpg")

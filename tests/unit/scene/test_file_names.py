@@ -76,6 +76,6 @@ def test_empty_and_meaningless_names_match_no_file(name):
     assert not pair(("p0.png",), name).files
 
 
-def test_names_may_differ_in_suffix_case_and_unicode_form():
+def test_file_names_may_differ_in_suffix_case_and_unicode_form():
     assert same_spelling("a/P0.PNG", "A/p0.jpg")
     assert not same_spelling("images/p0.png", "p0.png")

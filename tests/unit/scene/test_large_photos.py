@@ -90,7 +90,7 @@ def test_large_photos_are_trained_at_a_reduced_size(jpegs, small_limit, monkeypa
         assert np.abs(image - theirs.photo.image().numpy()).mean() < 4
 
 
-def test_a_folder_of_smaller_copies_also_solves_too_large_photos(tmp_path, small_limit):
+def test_too_large_photos_are_accepted_if_a_folder_of_smaller_copies_exists(tmp_path, small_limit):
     scene = write_tiny_scene(tmp_path, views=4, width=192, height=128, suffix=".png")
     with pytest.raises(UserError, match="_2, _4 or _8"):
         read(scene, max_size=96)

@@ -366,14 +366,14 @@ def labelled(labels):
 
 
 @pytest.mark.parametrize("labels", [(), ("a", "b"), "a", 3, (3,), (None,), {"a": 1}])
-def test_labels_must_be_one_text_for_each_view(labels):
+def test_a_sampler_must_return_one_text_label_for_each_view(labels):
     error = refused(setup_of({"sampler": labelled(labels)}))
     assert error.what == "the sampler returned a wrong number of labels"
     assert "sampler epoch" in error.where
 
 
 @pytest.mark.parametrize("labels", [["a"], np.array(["a"])])
-def test_labels_may_be_a_list(labels):
+def test_a_sampler_may_return_its_labels_as_a_list(labels):
     setup = setup_of({"sampler": labelled(labels)})
     assert take_step(setup, first_state(setup)).labels == ("a",)
 
