@@ -154,7 +154,7 @@ def extremes():
 
 @pytest.mark.parametrize("case", extremes())
 def test_extreme_gaussians_agree_with_the_float64_reference(name, case):
-    """Their images; gradients that are finite and not longer, which rounding may turn."""
+    """Compare images. Gradients must be finite and not longer than in the reference."""
     camera, scene = CAMERAS["middle"], extremes()[case]
     image, gradients, _ = drawn(RASTERIZERS[name](), leaves(scene, "cuda", torch.float32), camera)
     rounded = leaves(scene.mapped(lambda each: each.float()), "cpu", torch.float64)
@@ -280,7 +280,10 @@ def started(rasterizer, device="cuda", **options):
 )
 @pytest.mark.usefixtures("gsplat")
 def test_a_regular_step_synchronizes_the_gpu_at_most_three_times(options):
-    """For the losses, for the Gramians or what tells whether all is finite, and in gsplat."""
+    """A step reads the losses, and the Gramians or the check for finite gradients.
+
+    gsplat synchronizes once more.
+    """
     setup, state = started({"name": "gsplat"}, **options)
     for _ in range(5):
         timed_step(setup, state)
@@ -296,7 +299,7 @@ def test_a_regular_step_synchronizes_the_gpu_at_most_three_times(options):
     assert len(waits) <= 3, waits
 
 
-def test_steps_along_axes_agree_between_gpu_and_cpu():
+def test_steps_along_the_axes_of_gaussians_agree_between_gpu_and_cpu():
     draws = torch.Generator().manual_seed(0)
     arrays = [torch.randn(5000, columns, generator=draws) for columns in (3, 3, 3, 4)]
     on_gpu = [each.to("cuda") for each in arrays]
@@ -308,7 +311,7 @@ def test_steps_along_axes_agree_between_gpu_and_cpu():
 @pytest.mark.parametrize("backbone", ["vanilla", "scaffold"])
 @pytest.mark.usefixtures("gsplat")
 def test_floaters_agree_between_gpu_and_cpu(backbone):
-    """Primitives beside and behind the cameras; what is left is what the state goes on with."""
+    """Place primitives beside and behind the cameras. Compare the states after the removal."""
     options = {"backbone": {"name": backbone}}
     if backbone == "scaffold":
         options["backbone"]["voxel_size"] = 1e-2
@@ -337,7 +340,7 @@ def test_floaters_agree_between_gpu_and_cpu(backbone):
 @pytest.mark.parametrize("backbone", ["vanilla", "pixel", "mip", "distance", "scaffold", "octree"])
 @pytest.mark.parametrize("operator", ["sum", "pcgrad"])
 def test_every_backbone_trains_alike_on_gpu_and_cpu(name, backbone, operator):
-    """Without growth, whose draws and order would take them apart."""
+    """Train without growth, because growth uses random numbers and changes the order of rows."""
     if name == "gswarp" and backbone in {"mip", "pixel"}:
         pytest.skip("refused: docs/rasterizers.md")
     options = {

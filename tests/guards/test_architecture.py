@@ -41,7 +41,7 @@ def test_every_file_named_on_the_architecture_page_exists(name):
     assert (ROOT / name).is_file()
 
 
-def test_both_code_paths_name_files_of_the_core_and_of_a_plugin_package():
+def test_both_documented_code_paths_name_files_of_the_core_and_of_a_plugin_package():
     for title in ("The path of a photo", "The path of `--operator pcgrad`"):
         path = PAGE.partition(f"## {title}")[2].partition("\n## ")[0]
         named = re.findall(r"^\| `(\w+)/", path, re.MULTILINE)

@@ -23,5 +23,5 @@ def riddles(path):
 
 
 def test_module_and_class_docstrings_name_their_subject():
-    """`What X share` and `What is known of X` are riddles; a thing has a name."""
+    """Refuse docstrings such as `What X share`, because they name no subject."""
     assert not {str(path.relative_to(ROOT)): found for path in CODE if (found := riddles(path))}

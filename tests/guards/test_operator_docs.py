@@ -44,7 +44,7 @@ def test_a_section_has_its_five_lines_and_names_every_option(name):
     assert lines[3].startswith("- Options: none") == (not options)
 
 
-def test_the_table_of_scales_is_correct():
+def test_the_table_of_operator_scales_is_correct():
     lines = PAGE.split("| c(K) | operators |")[1].split("\n\n")[0].splitlines()[2:]
     known = {"K": lambda k: k, "1": lambda _: 1, "sqrt(K)": sqrt, "1 + c, 1 for K = 1": _cagrad}
     named = []

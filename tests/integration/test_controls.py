@@ -251,7 +251,9 @@ def test_the_batch_rule_averages_beta2_over_the_same_number_of_steps(steps, view
 
 @pytest.mark.parametrize(("planned", "beta2"), [(PASSES - 1, 0.98), (PASSES, 0.999)])
 @pytest.mark.parametrize("steps", [PASSES // 2, PASSES * 2])
-def test_the_planned_adam_rule_stays_when_the_clock_changes_the_length(planned, beta2, steps):
+def test_the_planned_adam_betas_do_not_change_when_the_clock_changes_the_length(
+    planned, beta2, steps
+):
     setup = assembled(steps=planned)
     setup = replace(setup, schedule=replace(setup.schedule, total=steps)).at_length(steps, None)
     assert rule_at(setup, 1) == AdamRule((0.7, beta2))
@@ -259,7 +261,7 @@ def test_the_planned_adam_rule_stays_when_the_clock_changes_the_length(planned, 
     assert setup.numbers.rate_factor == min(most, (30_000 / steps) ** power)
 
 
-def test_many_photos_make_the_second_moment_average_over_a_part_of_the_steps(monkeypatch):
+def test_runs_with_few_passes_average_the_second_moment_over_a_share_of_the_steps(monkeypatch):
     monkeypatch.setattr(auto, "FEW_PASSES", 10_000)
     for steps, memory in ((2_000, 50), (5_000, 100), (29_999, 599.98), (30_000, 1_000)):
         setup = assembled(steps=steps)
@@ -369,7 +371,7 @@ class Observed:
         return (yield)
 
 
-def test_densify_views_one_takes_each_position_of_a_step_in_turn():
+def test_densify_views_one_uses_one_view_per_step_at_alternating_positions():
     seen = Observed()
     _, state = trained(12, seen, views=3, densify_views="one")
     assert seen.got == [(views[(k + 1) % 3],) for k, views in enumerate(seen.drawn)]

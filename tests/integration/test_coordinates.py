@@ -118,7 +118,7 @@ def _float64(setup, state, coordinates):
 
 @pytest.mark.parametrize("scale", [1.0, 40.0, 3000.0])
 def test_a_file_in_utm_matches_the_shifted_points_to_a_millionth_of_the_extent(tmp_path, scale):
-    """In input coordinates, from a house to a city of 10 km."""
+    """Compare in input coordinates, for scenes from the size of a house to a city of 10 km."""
     offset = (5e5, 5e6, 120.0)
     size = {"views": 6, "width": 24, "height": 16, "points": 300}
     here, there = (
@@ -189,7 +189,7 @@ def test_evaluating_a_ply_in_other_coordinates_is_refused(trained, tmp_path):
 
 
 def test_options_of_the_reader_are_used_again_when_a_run_is_opened(scene, tmp_path):
-    """They say what a scene is, so that its run has to be opened with them."""
+    """The reader options determine the scene, so a run must be opened with the same options."""
     out = tmp_path / "run"
     options = {"name": "colmap", "gps": str(scene / "images"), "model": "sparse/0"}
     given = {"scene": str(scene), "out": str(out), "steps": 1, "threads": 1, "reader": options}

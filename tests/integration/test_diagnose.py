@@ -77,13 +77,13 @@ def test_the_diagnostics_observer_changes_no_bit_of_the_training(scene, tmp_path
     assert sorted({int(row["step"]) for row in table(tmp_path / "watched")}) == [6, 12]
 
 
-def test_a_probe_uses_the_grouping_of_the_run(scene, tmp_path):
+def test_a_gradient_probe_uses_the_grouping_of_the_run(scene, tmp_path):
     settings = {"sampler": {"name": "near-far"}, "grouping": {"name": "lists"}}
     run(scene, tmp_path / "run", observers=[OBSERVER], **settings)
     assert {row["grouping"] for row in table(tmp_path / "run")} == {"of the run"}
 
 
-def test_each_probe_records_its_duration(scene, tmp_path):
+def test_each_gradient_probe_records_its_duration(scene, tmp_path):
     run(scene, tmp_path / "run", steps=4, observers=[{**OBSERVER, "every": 1}])
     probing = {row["step"]: float(row["probe_seconds"]) for row in table(tmp_path / "run")}
     assert len(probing) == 4
@@ -134,7 +134,7 @@ def test_a_finished_run_is_diagnosed_at_its_final_state(scene, tmp_path, capsys)
     assert {row["grouping"] for row in table(tmp_path / "out")} == {"of the run"}
 
 
-def test_the_conflict_signature_can_be_sampled_by(scene, tmp_path):
+def test_a_sampler_can_use_the_labels_of_the_conflict_signature(scene, tmp_path):
     run(scene, tmp_path / "run")
     labels = tmp_path / "labels.csv"
     options = Options(per_group=4, signature=labels)
@@ -212,7 +212,7 @@ def diagnosed(scene, out):
     return end.value.code
 
 
-def test_a_training_that_fails_reports_its_probes_and_the_reason(
+def test_a_failed_training_reports_its_gradient_probes_and_the_reason(
     scene, tmp_path, monkeypatch, capfd
 ):
     monkeypatch.setattr("crossgrad_plugins.diagnostics.app.affordable_steps", lambda *given: 40)
@@ -227,7 +227,7 @@ def test_a_training_that_fails_reports_its_probes_and_the_reason(
 
 
 @pytest.mark.parametrize("compiling", [True, False], ids=["compiling", "training"])
-def test_a_training_that_fails_before_the_first_probe_is_reported(
+def test_a_training_that_fails_before_the_first_gradient_probe_is_reported(
     scene, tmp_path, monkeypatch, capfd, compiling
 ):
     if not compiling:

@@ -356,7 +356,7 @@ class Waiting:
 def test_a_training_photo_that_cannot_be_decoded_is_found_during_training(
     tmp_path, with_plugin, capsys, monkeypatch
 ):
-    """It is drawn in no step here: the sampler keeps to the first views."""
+    """No step renders the damaged photo, because the sampler uses the first views only."""
     scene = write_tiny_scene(tmp_path / "tiny", views=9)
     (scene / "train_list.txt").write_text("\n".join(f"{i:04}.png" for i in range(1, 8)))
     rotten(scene / "images" / "0007.png")

@@ -79,7 +79,9 @@ def test_exposure_auto_is_off_if_photos_agree_and_changes_no_bit(scene, tmp_path
     assert not (tmp_path / "none" / "exposure.json").exists()
 
 
-def test_exposure_auto_is_gain_if_photos_differ_and_none_suggests_gain(varied, tmp_path):
+def test_exposure_auto_selects_gain_if_photos_differ_and_exposure_none_suggests_gain(
+    varied, tmp_path
+):
     assert run(varied, tmp_path / "auto") == 0
     assert run(varied, tmp_path / "gain", exposure={"name": "gain"}) == 0
     assert run(varied, tmp_path / "none", exposure={"name": "none"}) == 0
@@ -118,7 +120,7 @@ def test_a_resumed_run_ends_with_the_bits_of_an_uninterrupted_run(varied, tmp_pa
     assert photos(tmp_path / "whole") == photos(tmp_path / "broken")
 
 
-def test_exposure_rates_fall_to_a_hundredth_and_rate_zero_keeps_initial_values(varied, tmp_path):
+def test_an_exposure_learning_rate_of_zero_keeps_the_initial_values(varied, tmp_path):
     kept = {"name": "gain", "rate": 0.0}
     assert run(varied, tmp_path / "one", steps=1, exposure=kept) == 0
     assert run(varied, tmp_path / "more", exposure=kept) == 0
@@ -146,7 +148,7 @@ def test_exposure_from_starts_at_the_values_of_another_run(varied, tmp_path):
 def test_photos_missing_from_the_file_keep_their_exposure_relative_to_other_photos(
     varied, tmp_path, model
 ):
-    """The file has three photos, each three stops brighter than in the run before."""
+    """The file contains three photos, each three stops brighter than in the earlier run."""
     kind = "matrix" if model == "affine" else "stops"
 
     def levels(values):

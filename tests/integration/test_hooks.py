@@ -129,7 +129,7 @@ def test_a_resumed_run_ends_with_the_bits_of_an_uninterrupted_run(scene, tmp_pat
     same(tmp_path / "whole", tmp_path / "broken")
 
 
-def test_the_record_of_a_step_contains_the_scales(scene, tmp_path):
+def test_the_record_of_a_step_contains_the_render_scales(scene, tmp_path):
     assert run(scene, tmp_path / "run", **ALTOGETHER, sampler={"name": "near-far"}, views=2) == 0
     last = load(latest(tmp_path / "run")).scalars["last"]
     expected = [0.5 if name.startswith("near") else 1.0 for name in last["names"]]
@@ -185,7 +185,7 @@ class PairOnly(Operator):
         return AggregateResult(context.gradients.total()), state
 
 
-def test_an_operator_that_some_step_cannot_use_is_refused():
+def test_an_operator_that_cannot_use_the_views_of_some_step_is_refused():
     selection = selection_of(
         sampler=load_plugin("samplers", "one-then-two")(), operator=PairOnly(), views_per_step=2
     )
@@ -201,7 +201,7 @@ class Quarter(Observer):
         return replace(answer, scales=tuple(0.25 for _ in answer.scales))
 
 
-def test_the_hook_of_the_scales_can_be_wrapped(scene, tmp_path, monkeypatch):
+def test_the_hook_of_render_scales_can_be_wrapped(scene, tmp_path, monkeypatch):
     build = assemble.make_manager
     monkeypatch.setattr(
         assemble, "make_manager", lambda plugins: build({**plugins, "quarter": Quarter()})
@@ -253,7 +253,7 @@ def test_gains_per_photo_identify_the_darker_photos(scene, tmp_path, views, back
     assert sum(stops.values()) == pytest.approx(0.0, abs=1e-5)
 
 
-def test_photos_not_rendered_in_a_step_change_by_the_projection_only(scene, tmp_path):
+def test_exposures_of_photos_not_rendered_in_a_step_change_by_the_projection_only(scene, tmp_path):
     assert run(scene, tmp_path / "run", steps=1, exposure={"name": "stops"}, views=1) == 0
     stops = stops_of(tmp_path / "run")
     drawn = load(latest(tmp_path / "run")).scalars["last"]["names"]
@@ -284,7 +284,9 @@ def test_two_columns_with_the_same_name_are_refused(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_scales_out_of_bounds_end_the_run_and_name_the_plugin(scene, tmp_path, monkeypatch, capsys):
+def test_render_scales_out_of_bounds_end_the_run_and_name_the_plugin(
+    scene, tmp_path, monkeypatch, capsys
+):
     from support.hook_plugins import NearAtHalf
 
     monkeypatch.setattr(NearAtHalf, "scales", lambda self, context, state: ((2.0, 1.0), state))

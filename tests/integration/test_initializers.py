@@ -49,7 +49,7 @@ def test_a_resumed_run_has_the_same_bits(scene, tmp_path):
 
 @pytest.mark.parametrize("options", [("--init", "random"), ("--recipe", "published")], ids=str)
 def test_options_that_exclude_filling_use_the_points_initializer(scene, tmp_path, options):
-    """Their configuration says so, and repeats the run."""
+    """The written configuration names the points initializer and repeats the run."""
     assert run(scene, tmp_path / "run", *options) == 0
     stored = read_config(tmp_path / "run")
     assert stored["initializer"] == {"name": "points"}

@@ -76,7 +76,7 @@ def test_a_length_chosen_by_the_planner_is_written_to_the_file(scene, tmp_path, 
     assert ended("run", "--config", file, "--dry-run", "-q") == 0
 
 
-def test_a_plan_for_the_bundled_scene_keeps_its_seconds(tmp_path, capsys):
+def test_a_plan_for_the_bundled_scene_contains_its_default_length(tmp_path, capsys):
     file = tmp_path / "plan.yaml"
     assert ended("plan", "--max-size", 64, "--write", file) == 0
     stored = read_mapping(file, "a configuration", "repair it")
@@ -148,7 +148,7 @@ def test_a_scene_with_a_single_photo_can_be_trained(tmp_path):
     assert settings(out)["data"]["init"] == "random"
 
 
-def test_a_probe_measures_quantities_that_need_gradients(tmp_path, capsys):
+def test_the_probe_option_measures_quantities_that_need_gradients(tmp_path, capsys):
     hybrid = write_tiny_scene(tmp_path / "hybrid", views=8, points=120, folders=("low", "high"))
     torch = ("--set", "rasterizer=torch", "--threads", 1, "--max-size", 24)
     assert ended("plan", hybrid, *torch, "--probe", 1, "--json") == 0

@@ -115,9 +115,7 @@ def test_a_run_with_unchanged_package_versions_is_resumed_without_a_message(stop
     assert signed(stopped) == ["from versioned-package 1.0: operator own-sum"]
 
 
-def test_another_version_of_crossgrad_must_be_accepted_like_that_of_a_plugin_package(
-    stopped, capsys
-):
+def test_another_version_of_crossgrad_must_be_accepted_like_another_plugin_version(stopped, capsys):
     text = (stopped / FILE).read_text().replace(cg.__version__, "0.1.9")
     (stopped / FILE).write_text(text)
     with pytest.raises(cg.UserError, match=r"crossgrad 0\.1\.9(.|\n)*--accept-plugins"):

@@ -98,7 +98,7 @@ def test_a_backbone_without_baking_cannot_export_for_a_view(scene, tmp_path):
 
 
 def test_results_of_a_step_newer_than_the_summary_get_separate_file_names(finished):
-    """A run that went on and was killed has a checkpoint that is newer than its summary."""
+    """A resumed run that was killed has a checkpoint that is newer than its summary."""
     path = finished / "summary.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "step": 2}))
     before = content(finished)

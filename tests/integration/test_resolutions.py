@@ -161,7 +161,7 @@ PARTS = {"far": {"photos": 4, "scales": [0.25]}, "near": {"photos": 5, "scales":
 
 
 @pytest.mark.parametrize("views", [1, 2])
-def test_an_extra_view_has_the_scale_of_its_own_regime_and_changes_no_other_view(views):
+def test_an_extra_view_has_the_render_scale_of_its_regime_and_changes_no_other_view(views):
     asked = {"resolution": {"name": "spectral", "smallest": 1, "courses": PARTS}, "views": views}
     scales = {"far": 0.25, "near": 0.5}
     streams = []

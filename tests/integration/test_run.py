@@ -210,7 +210,9 @@ def test_separate_gradients_kept_for_an_observer_give_the_same_bits(scene, tmp_p
     assert same(first.plugins["densifier"].per_primitive, second.plugins["densifier"].per_primitive)
 
 
-def test_joint_backward_agrees_to_rounding_and_counts_one_pass(scene, tmp_path):
+def test_joint_backward_agrees_with_separate_backward_to_rounding_and_counts_one_pass(
+    scene, tmp_path
+):
     run(scene, tmp_path / "separate", steps=3, eval_every=3)
     run(scene, tmp_path / "joint", steps=3, eval_every=3, backward="joint")
     first, second = parameters(tmp_path / "separate"), parameters(tmp_path / "joint")
@@ -350,7 +352,7 @@ def test_a_run_with_a_time_budget_and_a_rewind_can_be_repeated(scene, tmp_path, 
     assert same(parameters(tmp_path / "timed"), parameters(tmp_path / "again"))
 
 
-def test_a_bad_value_right_before_a_length_revision_is_rewound(scene, tmp_path, monkeypatch):
+def test_a_non_finite_value_right_before_a_length_revision_is_rewound(scene, tmp_path, monkeypatch):
     poisoned(monkeypatch, Poison([7]))
     assert run(scene, tmp_path / "run", save_every=100, revisions=[[4, 12], [7, 12]]) == 0
     assert "training returned to step 4" in (tmp_path / "run" / "log.txt").read_text()

@@ -40,7 +40,9 @@ def test_a_contradictory_scene_is_refused_with_the_cause_before_writing(scenes, 
     assert not (tmp_path / "run").exists()
 
 
-def test_an_accepted_scene_is_trained_and_its_configuration_repeats_the_run(scenes, tmp_path):
+def test_an_accepted_contradictory_scene_is_trained_and_its_configuration_repeats_the_run(
+    scenes, tmp_path
+):
     run = tmp_path / "run"
     asked = settings(scenes, "wrong", run)
     assert app.run(asked, verbosity=-1, accept_scene=True) == 0
@@ -51,7 +53,7 @@ def test_an_accepted_scene_is_trained_and_its_configuration_repeats_the_run(scen
     assert app.run(repeated, verbosity=-1) == 0
 
 
-def test_a_stopped_run_of_an_accepted_scene_can_be_resumed(scenes, tmp_path):
+def test_a_stopped_run_of_an_accepted_contradictory_scene_can_be_resumed(scenes, tmp_path):
     run = tmp_path / "run"
     asked = {**settings(scenes, "wrong", run), "stop_after": 1}
     assert app.run(asked, verbosity=-1, accept_scene=True) == 0

@@ -85,7 +85,7 @@ def spoilt(scene: Path, how: str) -> str:
 
 
 @pytest.mark.parametrize("change", ["a photo", "held out", "trained", "split", "another scene"])
-def test_another_scene_is_refused_with_the_difference(root, change):
+def test_a_run_opened_with_another_scene_is_refused_with_the_difference(root, change):
     words = spoilt(root / "scene", change)
     before = {path: path.read_bytes() for path in (root / "run").rglob("*.*") if path.is_file()}
     for look in (lambda _: resume(root), *looks(root).values()):

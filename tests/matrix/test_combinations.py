@@ -102,7 +102,7 @@ def require_same_again(row):
 
 @pytest.mark.parametrize("row", DESIGN, ids=" x ".join)
 def test_a_combination_trains_and_gives_the_same_bits_when_it_is_repeated(row):
-    """Each component is in at least two runs that are repeated."""
+    """Each component is used in at least two repeated runs."""
     if row in REPEATED:
         require_same_again(row)
     else:

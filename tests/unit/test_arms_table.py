@@ -46,7 +46,7 @@ def test_each_length_of_an_arm_has_a_row(tmp_path, printed):
     assert found == {"300 steps": ("1", "20.00"), "1,200 steps": ("1", "22.00")}
 
 
-def test_other_metrics_can_be_selected(tmp_path, printed):
+def test_metrics_other_than_psnr_can_be_selected_for_the_table(tmp_path, printed):
     RunFolder().write(tmp_path / "run")
     (row,) = printed(tmp_path, "--figures", "ssim")
     assert "psnr" not in row and row["ssim"] == "0.7000"

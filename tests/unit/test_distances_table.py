@@ -42,7 +42,9 @@ def write_run(folder, place, steps, seed, figures):
         )
 
 
-def test_near_views_are_listed_first_and_arms_are_compared_band_by_band(tmp_path, place, printed):
+def test_near_views_are_listed_first_and_arms_are_compared_per_distance_band(
+    tmp_path, place, printed
+):
     for seed, more in ((0, 0.0), (1, 0.2), (2, 0.4)):
         base = {"street": 20.0 + more, "aerial": 25.0 + more}
         write_run(tmp_path / f"runs/a{seed}", place, 300, seed, base)
@@ -130,7 +132,9 @@ def test_tables_of_another_scene_with_the_same_name_are_not_used(
 
 
 @pytest.mark.parametrize("files", [(), ("--files",)], ids=["model", "ply"])
-def test_tables_of_another_state_of_a_run_are_not_used(tmp_path, place, printed, evaluated, files):
+def test_tables_of_another_step_or_model_file_of_a_run_are_not_used(
+    tmp_path, place, printed, evaluated, files
+):
     run = write_evaluable(tmp_path / "runs" / "a")
     options = tmp_path / "runs", "--of", "city", "--on", place, *files
     assert psnr_of(printed, *options) == ["20.00"] * 2

@@ -39,7 +39,7 @@ def test_the_benchmark_without_a_gpu_ends_with_code_2(script, monkeypatch, capsy
 
 
 def test_every_benchmark_case_is_accepted_by_crossgrad(script, tmp_path):
-    """All options are known; a machine without a GPU is the only thing to object to."""
+    """All options are known. The only objection is that the machine has no GPU."""
     cases = list(script.cases(10, 60))
     assert len(cases) == len({case.name for case in cases})
     for part in ("long", "usual"):
@@ -54,7 +54,7 @@ def test_every_benchmark_case_is_accepted_by_crossgrad(script, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("gaussians", [0, 500])
 def test_short_cases_run_in_the_process_of_the_benchmark(script, tmp_path, monkeypatch, gaussians):
-    """Measured here on the CPU, with what a GPU would be asked left out."""
+    """The cases run on the CPU without the GPU queries."""
     cloud = import_module("scale").Run
     begun, config, on_cpu = cloud.__init__, script.Case.config, {"device": "cpu"}
     monkeypatch.setattr(cloud, "__init__", lambda run, cell, **o: begun(run, cell, **o | on_cpu))
@@ -162,7 +162,7 @@ def test_long_runs_are_trained_once_and_refusals_are_recorded(script, tmp_path, 
 
 
 def test_results_of_the_gsplat_trainer_are_read_from_its_files(script, tmp_path):
-    """At every stop that it reached; it is not started again where it reached the last one."""
+    """Read results of every stop that was reached. A finished training is not repeated."""
     stats = tmp_path / "runs" / "gsplat-trainer-8000" / "stats"
     stats.mkdir(parents=True)
     for stop, seconds in ((7000, 7.0), (8000, 9.6)):

@@ -156,7 +156,7 @@ def test_the_penalty_contains_length_and_squared_derivative_at_the_training_came
     assert float(regularized(backbone, parameters, step).loss.detach()) == pytest.approx(wanted)
 
 
-def test_the_penalty_is_absent_per_view_and_without_conditions():
+def test_the_penalty_is_absent_for_single_views_and_without_distance_conditions():
     parameters = created(DistanceConditioned())
     drawn = DistanceConditioned().decode(parameters, sample_camera(), sample_phase())
     assert regularized(DistanceConditioned(), parameters, 1, drawn) is None

@@ -63,7 +63,7 @@ def test_the_number_of_levels_follows_from_the_distance_ratio(ratio, fork, level
     assert number_of_levels(5.0 * ratio, 5.0, fork) == levels
 
 
-def test_the_bounding_range_covers_all_axes_together():
+def test_the_bounding_range_is_one_interval_for_the_coordinates_of_all_axes():
     points = np.array([[-2.0, 0.0, 1.0], [0.5, 3.0, -1.0]])
     assert bounding_range(points) == pytest.approx((-2.2, 5.5))
     assert bounding_range(np.ones((4, 3)))[1] == 0.0
@@ -72,7 +72,7 @@ def test_the_bounding_range_covers_all_axes_together():
 @pytest.mark.parametrize("edge", [0.3, 2.71, 16.77, 1e6])
 @pytest.mark.parametrize("levels", [1, 2, 4, 7])
 @pytest.mark.parametrize("fork", [2, 3])
-def test_the_level_below_the_middle_has_the_requested_cell_size(edge, levels, fork):
+def test_the_level_below_the_middle_has_about_the_requested_cell_size(edge, levels, fork):
     cell = root_cell(edge, -1, root_above(0.02, levels, fork))
     halvings = math.log2(edge / cell)
     assert halvings == pytest.approx(round(halvings), abs=1e-9)
@@ -143,7 +143,7 @@ def test_one_point_has_anchors_on_finer_levels_only_with_plant_everywhere(everyw
     ("x", "wanted"), [((0.1, 0.2), [0, 1, 1]), ((0.01, 0.05), [0, 3, 3]), ((0.1, 0.1), [0])]
 )
 def test_levels_that_separate_no_points_get_no_anchors(x, wanted):
-    """Cells of 1/2, 1/4, 1/8 and 1/16 around 0."""
+    """The cells have sizes 1/2, 1/4, 1/8 and 1/16 around the origin."""
     points = np.array([[each, 0.0, 0.0] for each in x])
     assert init_anchors(points, lattice(4), everywhere=False).levels.tolist() == wanted
 
@@ -174,7 +174,7 @@ def test_float32_distinguishes_the_cells_of_the_finest_level(fork, reach):
     assert resolvable_levels(3, fork, 0.5, 0.0) == 3
 
 
-def test_the_automatic_visible_share_is_the_mean():
+def test_the_automatic_threshold_is_the_mean_of_the_visible_shares():
     shares = torch.tensor([1.0, 0.5, 0.0], dtype=torch.float64)
     assert visible_share(shares, -1.0) == 0.5
     assert visible_share(shares, 0.01) == 0.01

@@ -60,7 +60,7 @@ def leveled(seed=0, **options):
 
 
 def test_levels_and_lattice_agree_with_a_scene_calculated_by_hand():
-    """Cameras 1 and 8 away from a single point: D = 8, d = 1, four levels."""
+    """Two cameras are 1 and 8 units away from a single point: D = 8, d = 1, four levels."""
     backbone = Octree(dist_ratio=1.0, base_layer=2, visible_threshold=0.0, plant_everywhere=True)
     scene = scene_of([1.0, 8.0], [[0.0, 0, 0], [1e-9, 0, 0]])
     parameters = backbone.create(scene, np.random.default_rng(0))
@@ -124,7 +124,7 @@ def test_used_anchors_and_their_fade_factors_agree_with_the_formula(rounding):
     assert 0 < int(used.mask.sum()) < len(used.mask) or rounding in {"ceil", "progressive"}
 
 
-def test_a_moving_camera_fades_levels_in_and_always_uses_the_coarsest():
+def test_a_moving_camera_fades_levels_in_and_always_uses_the_coarsest_level():
     backbone, parameters, scene = leveled(rounding="progressive", visible_threshold=0.0)
     camera, before = scene.views[0].camera, None
     for far in np.geomspace(0.4, 40.0, 400):
@@ -144,7 +144,10 @@ def test_a_moving_camera_fades_levels_in_and_always_uses_the_coarsest():
     ("step", "top"), [(0, 1), (1, 1), (2499, 1), (2500, 2), (9_999, 2), (10_000, 2), (40_000, 2)]
 )
 def test_training_opens_levels_one_by_one_and_evaluation_uses_all_levels(step, top):
-    """Three levels, coarse phase of 2500 of 10,000 steps, one level to open."""
+    """The run has three levels, 10,000 steps and a coarse phase of 2500 steps.
+
+    One level opens later.
+    """
     backbone, parameters, scene = leveled(visible_threshold=0.0)
     parameters["extra_levels"][:] = 9.0
     schedule = Schedule.for_run(10_000)

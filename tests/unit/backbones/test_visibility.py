@@ -48,7 +48,7 @@ def test_points_in_front_of_the_near_plane_are_not_visible(near):
     assert seen.tolist() == [False, near < 0.51, True]
 
 
-def test_the_finest_pixel_belongs_to_the_nearest_camera_in_pixels():
+def test_the_finest_pixel_has_the_smallest_ratio_of_depth_to_focal_length():
     expected = []
     for mean in means().numpy():
         looks = [(camera, *looked_at(mean, camera)) for camera in CAMERAS]

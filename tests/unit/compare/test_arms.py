@@ -65,7 +65,7 @@ def test_an_arm_name_contains_both_settings_that_differ(tmp_path):
     ]
 
 
-def test_options_distinguish_arms_of_one_component_next_to_another_component(tmp_path):
+def test_options_distinguish_two_arms_of_one_component_if_a_third_uses_another_component(tmp_path):
     found = names(
         tmp_path,
         RunFolder(settings={"operator": {"name": "cagrad", "c": 0.4}}),

@@ -62,7 +62,7 @@ def test_two_scenes_with_the_same_name_are_refused(tmp_path):
 
 @pytest.mark.parametrize("content", ['{"format": 1, "views": {"a/1.j', "{}", "[]", '{"views": 1}'])
 def test_a_run_with_a_damaged_scene_file_is_refused_or_left_out(tmp_path, content):
-    """Without it nobody would see that photos differ."""
+    """Without the scene file, a difference between the photos of two runs would not be found."""
     RunFolder().write(tmp_path / "1")
     other = RunFolder(views_per_step=2).write(tmp_path / "2")
     (other / "scene.json").write_text(content)

@@ -115,7 +115,9 @@ def test_a_time_budget_counts_as_the_length_for_any_number_of_steps(tmp_path):
 
 
 @pytest.mark.parametrize(("metric", "sign"), [("psnr", 1.0), ("lpips", -1.0)])
-def test_at_least_half_of_the_weakest_arm_reaches_the_default_target(tmp_path, metric, sign):
+def test_at_least_half_of_the_runs_of_the_weakest_arm_reach_the_default_target(
+    tmp_path, metric, sign
+):
     ends = {1: (20.0, 20.4, 20.6, 22.0), 2: (23.0, 24.0, 25.0, 26.0)}
     for views, finals in ends.items():
         for seed, final in enumerate(finals):

@@ -141,7 +141,7 @@ def test_the_page_loads_local_files_only(written):
     assert len(text) < 3_000_000
 
 
-def test_names_are_shown_and_not_executed(written):
+def test_names_of_runs_are_shown_on_the_page_and_not_executed(written):
     texts = "".join(Reader((written / "index.html").read_text()).texts)
     assert SCENE in texts
     assert VIEW in texts

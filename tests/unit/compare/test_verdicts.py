@@ -41,7 +41,7 @@ def test_the_interquartile_mean_of_few_values_is_correct(values, expected):
     assert iqm(np.array(values)) == pytest.approx(expected)
 
 
-def test_below_ten_pairs_the_test_is_students_t():
+def test_with_fewer_than_ten_pairs_verdicts_use_students_t_test():
     values = RNG.normal(0.1, 0.2, 7)
     found = estimate(values, ["a"] * 7, 0.1)
     peer = ttest_1samp(values, 0.0)
@@ -54,7 +54,7 @@ def test_below_ten_pairs_the_test_is_students_t():
     assert found.p_equivalent == pytest.approx(max(greater, less))
 
 
-def test_from_ten_pairs_on_the_interval_is_a_widened_bootstrap():
+def test_with_ten_or_more_pairs_verdicts_use_a_widened_bootstrap_interval():
     values = RNG.normal(0.1, 0.2, 16)
     found = estimate(values, ["a"] * 16, 0.1)
     assert found.method == IQM
@@ -81,7 +81,7 @@ def test_a_difference_far_above_the_noise_stays_different_among_100_comparisons(
     assert verdicts([found] * 100) == [Verdict.DIFFERENT] * 100
 
 
-def test_bootstrap_p_values_fall_steadily_beyond_all_resamples():
+def test_bootstrap_p_values_decrease_steadily_beyond_the_range_of_resamples():
     law = Bootstrap.of(RNG.normal(0.0, 1.0, 12), ["a", "b", "c"] * 4)
     borders = np.linspace(1.0, 9.0, 33)
     above = [law.sf(border) for border in borders]
@@ -93,7 +93,7 @@ def test_bootstrap_p_values_fall_steadily_beyond_all_resamples():
 
 
 @pytest.mark.parametrize(("value", "expected"), [(0.0, "equivalent"), (0.5, "different")])
-def test_many_pairs_without_noise_get_the_verdict_of_few_pairs(value, expected):
+def test_without_noise_many_pairs_get_the_same_verdict_as_few_pairs(value, expected):
     family = [estimate([value] * pairs, ["a"] * pairs, 0.1) for pairs in (3, 12)]
     assert {str(verdict) for verdict in verdicts(family * 10)} == {expected}
 
@@ -206,7 +206,7 @@ def test_more_than_five_comparisons_are_corrected():
     ],
 )
 def test_scenes_that_contradict_a_verdict_are_reported(levels, verdict, contradicting):
-    """The interquartile mean leaves a scene out that is unlike the others."""
+    """The interquartile mean leaves out a scene whose values are far from the other scenes."""
     scenes = [f"s{number}" for number in range(4) for _ in range(3)]
     values = np.repeat(levels, 3) + np.tile([-0.02, 0.0, 0.02], 4)
     found = estimate(values, scenes, 0.1)

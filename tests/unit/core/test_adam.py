@@ -88,7 +88,7 @@ def test_the_kernel_agrees_with_the_reference_at_every_magnitude(magnitude):
 @pytest.mark.parametrize("magnitude", [1e-12, 1e-6, 1.0, 1e15, 1e30])
 @pytest.mark.parametrize("scale", [1.0, 0.25])
 def test_the_gpu_update_agrees_with_the_reference(magnitude, scale):
-    """Torch's fused Adam, which also runs here; ages need not be whole."""
+    """Use the fused Adam of PyTorch, which also runs on the CPU. Step counts may be fractions."""
     generator = torch.Generator().manual_seed(4)
     param = torch.randn(3000, generator=generator)
     ours = [param.clone(), torch.zeros(3000), torch.zeros(3000)]
@@ -106,7 +106,7 @@ def test_the_gpu_update_agrees_with_the_reference(magnitude, scale):
 
 @pytest.mark.parametrize("bad", [torch.inf, -torch.inf, torch.nan])
 def test_a_non_finite_gradient_makes_gpu_parameters_non_finite(bad):
-    """No step of a GPU looks for it, so that it must not become a large number."""
+    """A GPU step checks no gradient, so the parameters must show a non-finite gradient."""
     tensors = [torch.ones(3), torch.zeros(3), torch.zeros(3)]
     update_on_gpu(tensors[0], torch.tensor([1.0, bad, 1.0]), *tensors[1:], coefficients(1.0))
     assert tensors[0].isfinite().tolist() == [True, False, True]
@@ -114,7 +114,7 @@ def test_a_non_finite_gradient_makes_gpu_parameters_non_finite(bad):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_memory_of_moments_marked_as_zero_is_not_read(dtype):
-    """Also where no gradient has moved anything, as in the second half."""
+    """All gradients in the second half of the tensor are zero."""
     grad = torch.cat([tensors(6)["means"].flatten(), torch.zeros(70_000)]).to(dtype)
     found = []
     for first, names in ((0.0, ()), (torch.nan, {"x"})):
@@ -230,7 +230,7 @@ def test_invalid_arguments_are_refused(grad, options):
 
 @pytest.mark.parametrize("last", ["grad", "exp_avg", "exp_avg_sq"])
 def test_only_elements_with_nonzero_gradient_or_moments_change(last):
-    """Runs of zeros are left out: every place of the first and last number that is not zero."""
+    """Test every position of the first and last nonzero number. Runs of zeros are skipped."""
     size = 3 * 2**13 + 5
     rule = coefficients()
     for at in (0, 63, 64, 2**13 - 1, 2**13, 2 * 2**13 + 64, size - 1):

@@ -16,7 +16,7 @@ BLOCKS = tuple(
 )
 
 
-def test_views_without_a_common_element_are_counted_and_added():
+def test_gradients_without_a_common_nonzero_element_are_counted_and_added():
     one = {
         "apart": torch.tensor([1.0, 0.0]),
         "crossed": torch.tensor([1.0, 1.0]),

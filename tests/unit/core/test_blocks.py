@@ -12,7 +12,7 @@ def test_learning_rates_must_be_finite_and_not_negative(rates):
 
 
 @pytest.mark.parametrize("factor", [0.0, -2.0, float("nan"), float("inf")])
-def test_the_rate_factor_for_few_passes_must_be_positive(factor):
+def test_the_learning_rate_factor_for_few_passes_must_be_positive(factor):
     with pytest.raises(ValueError, match="`few_passes` must be a positive number"):
         LearningRate(1e-3, few_passes=factor)
 

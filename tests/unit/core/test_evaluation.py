@@ -91,7 +91,7 @@ def test_renders_are_rounded_to_8_bits_before_comparison(render: float, seen: in
     assert result.views[0]["psnr"] == pytest.approx(decibel(abs(seen - 90)), abs=1e-4)
 
 
-def test_masked_pixels_do_not_count():
+def test_masked_pixels_do_not_count_in_the_metrics():
     mask = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
     mask[:, 20:] = False
     image = torch.full((HEIGHT, WIDTH, 3), 110 / 255.0)
@@ -100,7 +100,7 @@ def test_masked_pixels_do_not_count():
     assert result.views[0]["psnr"] == pytest.approx(decibel(10), abs=1e-4)
 
 
-def test_a_fully_masked_view_does_not_count():
+def test_a_fully_masked_view_does_not_count_in_the_means():
     nothing = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     views = [make_view("a", "x", 110, nothing), make_view("b", "x", 110)]
     result = evaluate(views, flat(100), (*METRICS[:3], Constant()))

@@ -47,7 +47,7 @@ def test_missing_and_empty_tensors_count_as_finite_and_zero():
 
 @pytest.mark.parametrize("seed", range(30))
 def test_checking_many_tensors_at_once_equals_checking_each_tensor(seed):
-    """Of all kinds, sizes about those of the parts in which they are looked at, in any order."""
+    """Use tensors of all kinds in any order, with sizes close to the size of a checked chunk."""
     rng = np.random.default_rng(seed)
     tensors = []
     for _ in range(rng.integers(0, 9)):

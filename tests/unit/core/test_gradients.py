@@ -182,7 +182,7 @@ def test_a_missing_gradient_counts_as_zero(granularity):
 
 
 def test_events_of_an_aggregation_are_counted():
-    """One block of each sort: conflicting, agreeing but disjoint, zero, not finite."""
+    """Use one block of each kind: conflicting, agreeing but disjoint, zero, and not finite."""
     one = {"means": torch.ones(50, 3), "scales": torch.zeros(50, 3), "opacities": torch.ones(50, 1)}
     two = {"means": -torch.ones(50, 3), "scales": torch.zeros(50, 3), "opacities": None}
     one["scales"][:25], two["scales"][25:] = 1.0, 1.0
@@ -344,7 +344,7 @@ def test_operators_accept_every_granularity(name, granularity):
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 7])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
 def test_the_mean_is_the_sum_divided_by_all_views_to_the_bit(count, dtype, absent):
-    """Divided once, after the sum; views without a gradient count."""
+    """The sum is divided once. Views without a gradient count in the divisor."""
     views = make_views(count, dtype)
     views[min(absent, count - 1)]["means"] = None
     views[0]["mlp.1"][0] = float("nan")
@@ -405,7 +405,7 @@ def test_aggregate_equals_the_default_gramian_aggregation():
 @pytest.mark.parametrize("count", [1, 2, 3, 5])
 @pytest.mark.parametrize("bad", [None, "first", "middle", "last", "all"])
 def test_deferred_sums_equal_immediate_sums(count, bad):
-    """What is left out, what is counted as present, and the sum and the mean that remain."""
+    """Compare the omitted views, the views counted as present, the sum and the mean."""
     views = make_views(count)
     views[0]["scales"].zero_()
     views[-1]["opacities"] = None

@@ -28,12 +28,12 @@ def test_packing_a_lattice_keeps_every_number():
 
 
 @pytest.mark.parametrize("fork", [2, 3])
-def test_cells_shrink_by_the_factor_fork_from_level_to_level(fork):
+def test_cells_of_each_finer_level_are_smaller_by_the_factor_fork(fork):
     cells = lattice(fork=fork).cells(torch.arange(5))
     assert cells.tolist() == pytest.approx([0.5 / fork**level for level in range(5)], rel=1e-15)
 
 
-def test_lattice_sites_are_the_nearest_ones_and_their_positions_map_back_to_the_sites():
+def test_lattice_sites_are_nearest_to_their_points_and_recovered_from_their_positions():
     rng = np.random.default_rng(0)
     points, levels = cloud(rng)
     grid = lattice()
@@ -81,7 +81,7 @@ def test_level_0_is_always_visible_and_a_camera_inside_an_anchor_sees_every_leve
     assert not grid.detail(distances * 0, none).isnan().any()
 
 
-def test_visible_shares_count_the_cameras_that_see_an_anchor():
+def test_the_visible_share_of_an_anchor_is_the_share_of_cameras_that_see_it():
     rng = np.random.default_rng(2)
     anchors, levels = cloud(rng, 30)
     cameras = torch.from_numpy(rng.uniform(-6, 6, (7, 3)))

@@ -158,7 +158,7 @@ def test_an_unknown_name_is_refused_with_a_suggestion(good):
     assert "did you mean 'good'?" in error.todo
 
 
-def test_the_error_for_a_name_of_another_slot_names_this_slot():
+def test_the_error_for_a_name_of_another_slot_names_the_other_slot():
     assert (
         "a component with the name radial exists in the slot grouping"
         in refusal("operators", "radial").todo

@@ -27,7 +27,7 @@ def test_the_published_schedule_holds_at_the_reference_length():
     assert Schedule.for_run(30_000) == replace(absolute, mode="scaled")
 
 
-def test_short_runs_are_scaled_with_floors_and_have_no_reset():
+def test_short_runs_have_a_scaled_schedule_with_minimum_values_and_no_reset():
     schedule = Schedule.for_run(2000)
     assert (schedule.densify_from, schedule.densify_until) == (500, 1000)
     assert schedule.densify_every == 100
@@ -49,7 +49,7 @@ def test_sh_degree_grows_by_one_per_interval(step, degree):
 
 
 @pytest.mark.parametrize("every", range(1, 20))
-def test_sparse_updates_happen_once_in_n_steps_and_reach_all_views_of_a_cycle(every):
+def test_sparse_updates_happen_once_in_every_n_steps_and_reach_all_views_of_a_cycle(every):
     learns = np.array([learns_in(step, every) for step in range(1, 100 * every + 1)])
     assert (learns.reshape(100, every).sum(axis=1) == 1).all()
     for turns in (2, 3, 4, 8):
@@ -68,7 +68,7 @@ def test_edits_are_counted_without_a_loop_over_the_steps(total, mode):
         assert schedule.edits(after) == sum(step > after for step in edits)
 
 
-def test_a_new_length_moves_future_ends_and_no_interval():
+def test_a_new_length_moves_future_ends_in_the_schedule_and_changes_no_interval():
     schedule = Schedule.for_run(20_000)
     longer = schedule.with_length(Schedule.for_run(40_000), 3000)
     assert (longer.total, longer.lr_until, longer.densify_until) == (40_000, 40_000, 20_000)
@@ -200,7 +200,7 @@ def test_the_warm_up_is_unchanged_if_there_are_more_photos_than_views_between_ed
     assert schedule.edits() == FEWEST_EDITS
 
 
-def test_edits_of_a_budget_depend_on_the_new_length_in_both_directions():
+def test_the_minimum_number_of_edits_with_a_budget_follows_the_new_length():
     setup = assemble(RunConfig(steps=700, views=1), sample_scene(), "none")
 
     def schedule(views):
@@ -214,7 +214,7 @@ def test_edits_of_a_budget_depend_on_the_new_length_in_both_directions():
     assert long.with_length(short, 100).min_refinements == 0
 
 
-def test_floors_count_in_views_without_min_refinements():
+def test_without_min_refinements_the_minimum_values_of_a_schedule_count_views():
     def default(steps, photos=24):
         return Schedule.for_run(
             steps, counting=Counting("views", ViewsPerStepSpec.parsed("2"), photos)
@@ -268,7 +268,7 @@ def test_edits_of_a_flat_schedule_after_the_end_of_the_run_do_not_count(text, vi
         assert schedule.edits(after) == sum(step > after for step in edits)
 
 
-def test_a_flat_schedule_in_steps_has_the_floors_of_a_short_run():
+def test_a_flat_schedule_in_steps_has_the_minimum_values_of_a_short_run():
     flat = Schedule.for_run(4000, "absolute", Counting(schedule_length=2000))
     short = Schedule.for_run(2000)
     assert view_counts(flat) == view_counts(short) == [600, 700, 800, 900]

@@ -65,7 +65,9 @@ def test_a_container_quota_limits_the_cores(monkeypatch, tmp_path, content, core
 
 
 @pytest.mark.parametrize("content", ["max 100000", "", None])
-def test_the_affinity_limits_the_cores_without_a_container_quota(monkeypatch, tmp_path, content):
+def test_without_a_container_quota_the_number_of_cores_follows_the_cpu_affinity(
+    monkeypatch, tmp_path, content
+):
     limit = tmp_path / "cpu.max"
     if content is not None:
         limit.write_text(content)

@@ -98,7 +98,7 @@ def test_small_gaussians_are_cloned_large_ones_are_split_and_statistics_reset():
 
 
 def test_children_of_a_split_are_sampled_from_their_parent():
-    """mean + R (s n) with n standard normal, on a turned and stretched parent."""
+    """A child is at mean + R (s n) with n standard normal. The parent is rotated and stretched."""
     rng = np.random.default_rng(5)
     params = parameters()
     with torch.no_grad():
@@ -130,7 +130,7 @@ def test_transparent_gaussians_are_pruned_and_large_ones_only_after_a_reset():
     assert late.source.tolist() == [2]
 
 
-def test_the_largest_gradients_grow_first_near_the_limit_and_skipped_ones_are_counted():
+def test_the_largest_gradients_grow_first_near_the_limit_and_skipped_gaussians_are_counted():
     view = record([[1e-5, 0], [3e-5, 0], [2e-5, 0], STILL], [1] * 4)
     ctx = context([view], step=600, params=parameters((0.005,) * 4), room=1)
     edit, _ = AdaptiveDensityControl().densify(ctx, PluginState())
@@ -150,7 +150,7 @@ def test_a_reset_caps_opacities_and_clears_their_moments():
 
 
 def test_a_reset_with_an_edit_caps_the_opacity_rendered_after_the_edit():
-    """The filter of backbone mip depends on where the children are."""
+    """The filter of backbone mip depends on the positions of the children."""
     backbone = MipSplatting()
     rng = np.random.default_rng(0)
     params = backbone.create(sample_scene(), rng)

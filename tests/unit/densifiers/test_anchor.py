@@ -166,7 +166,7 @@ def test_statistics_are_discarded_after_the_last_edit():
     assert edit == NO_EDIT and not state.per_primitive
 
 
-def test_the_densification_window_is_the_published_one_of_anchors_without_resets():
+def test_the_densification_window_of_anchors_is_as_published_and_has_no_resets():
     assert (SCHEDULE.densify_from, SCHEDULE.densify_until) == (1500, 15_000)
     assert SCHEDULE.reset_every is None
     assert not SCHEDULE.densifies(1500) and SCHEDULE.densifies(1600)
@@ -265,7 +265,7 @@ def test_growth_agrees_with_the_published_rules(seed):
             np.testing.assert_allclose(found[level][place], features, rtol=1e-6)
 
 
-def test_a_level_does_not_grow_while_no_level_before_it_has_grown():
+def test_a_level_of_anchors_grows_only_after_a_coarser_level_has_grown():
     parameters = model()
     state = state_of(parameters)
     # All stay in the one cell of 16 voxels that is taken, but not in their own voxels.
@@ -342,9 +342,7 @@ def test_an_anchor_that_never_contributes_is_removed():
 
 
 @pytest.mark.parametrize(("total", "renders", "views"), [(30_000, 40, 80), (6000, 20, 40)])
-def test_statistics_of_judged_offsets_restart_and_the_remaining_ones_continue(
-    total, renders, views
-):
+def test_statistics_of_judged_offsets_restart_and_other_statistics_continue(total, renders, views):
     parameters = model()
     state = state_of(parameters)
     schedule = AnchorControl().window(Schedule.for_run(total))
@@ -409,7 +407,7 @@ def test_an_empty_model_is_not_an_error():
     assert all(len(tensor) == 0 for tensor in state.per_primitive.values())
 
 
-def test_exactly_the_equal_cells_have_equal_numbers():
+def test_two_cells_have_the_same_number_exactly_if_they_are_equal():
     rng = np.random.default_rng(0)
     cells = rng.integers(-3, 4, (500, 3)) * np.array([1, 2**30, -(2**35)])
     found = numbered(torch.from_numpy(cells)).tolist()
@@ -444,7 +442,7 @@ def test_offsets_outside_the_range_of_cells_do_not_grow():
     assert edit.source is None
 
 
-def test_views_without_slots_are_reported_as_an_error_of_the_backbone():
+def test_gaussians_without_slots_are_reported_as_an_error_of_the_backbone():
     parameters = model()
     (view,) = drawn_records(len(parameters["anchors"]), 1)
     view = replace(view, gaussians=replace(view.gaussians, slot=None))

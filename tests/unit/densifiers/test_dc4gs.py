@@ -215,7 +215,7 @@ def test_small_gaussians_are_cloned_by_mean_gradient_and_large_ones_split_by_dir
     assert edit.counts["cloned"] == 1 and edit.counts["split"] == 1
 
 
-def test_the_mean_over_views_is_compared_with_the_threshold():
+def test_the_mean_statistic_over_views_is_compared_with_the_split_threshold():
     # (1 - 0) ga = 2e-5 * 100 * 30 in the first view, nothing in the second.
     views = [record([parting(0.0, 2e-5)]), record([parting(9.0, 2e-5)])]
     for threshold, grows in ((0.029, True), (0.031, False)):

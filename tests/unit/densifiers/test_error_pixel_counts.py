@@ -195,7 +195,7 @@ def test_counting_uses_a_share_of_the_steps_and_always_the_step_of_the_edit():
 
 
 def test_marked_pixels_count_in_full_photo_pixels_at_any_render_scale():
-    """A quarter of the pixels count four times each."""
+    """If a quarter of the pixels is rendered, each pixel counts four times."""
     ctx = context(rasterizer="numba")
     record = recorded(ctx, 4, 0.5)
     assert record.image.shape[:2] == (HEIGHT // 2, WIDTH // 2)

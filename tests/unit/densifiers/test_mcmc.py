@@ -77,7 +77,7 @@ def mixed(n=60, dead=20, seed=1):
     return rng.permutation(opacities).tolist()
 
 
-def test_dead_gaussians_move_onto_live_ones_and_all_copies_share_the_opacity():
+def test_dead_gaussians_move_onto_live_gaussians_and_all_copies_share_the_opacity():
     opacities = mixed()
     params = parameters(opacities)
     edit, _ = MarkovChainMonteCarlo(growth=0).densify(densify_context(params), EMPTY_STATE)
@@ -146,7 +146,7 @@ def test_extreme_opacities_give_finite_values(logit):
     assert new["means"].shape[0] == 60
 
 
-def test_no_edit_happens_if_all_gaussians_are_dead_or_at_other_steps():
+def test_no_edit_happens_if_all_gaussians_are_dead_or_between_the_edit_steps():
     params = parameters([0.5] * 30)
     with torch.no_grad():
         params["opacities"][:] = -1e4
@@ -157,7 +157,7 @@ def test_no_edit_happens_if_all_gaussians_are_dead_or_at_other_steps():
 
 
 @pytest.mark.parametrize(("mode", "total"), [("scaled", 30_000), ("absolute", 7_000)])
-def test_edits_run_from_500_to_25_000_of_30_000_without_resets(mode, total):
+def test_edits_happen_from_step_500_to_step_25_000_of_30_000_without_resets(mode, total):
     window = MarkovChainMonteCarlo().window(Schedule.for_run(total, mode))
     assert (window.densify_from, window.densify_until, window.densify_every) == (500, 25_000, 100)
     assert window.reset_every is None

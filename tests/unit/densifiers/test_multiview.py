@@ -36,7 +36,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.arrays import TileLists
 
 
 def test_candidates_are_sampled_by_weight_without_replacement():
-    """The order of three of them, against the product of the shares of what is left."""
+    """Compare the order of three candidates with the product of their remaining shares."""
     score = torch.tensor([0.0, 0.9, 0.5, 0.5])
     weight = 1 / (1 - score[:3].double().numpy())
     candidates = torch.tensor([True, True, True, False])
@@ -147,7 +147,7 @@ def test_the_largest_error_per_visit_grows_first_near_the_limit():
     assert edit.counts["held_back"] == 2
 
 
-def test_half_of_the_pruning_candidates_are_removed_and_the_remaining_ones_capped():
+def test_half_of_the_pruning_candidates_are_removed_and_remaining_opacities_are_capped():
     params = few([1e-4] * 7, [0.001, 0.002, 0.003, 0.004, 0.9, 0.79, 0.81])
     state = planted([0] * 7, [0.0] * 7, [0.0] * 7, error=[0.0, 1.0, 0.9999, 0.0, 0.0, 0.0, 0.0])
     edit, _ = Planted().densify(context(params=params), state)
@@ -177,7 +177,7 @@ def test_the_opacity_cap_applies_after_the_filter_of_the_backbone():
     assert float(drawn.detach().max()) <= 0.8 + 1e-5
 
 
-def test_disabled_cap_and_full_pruning_agree_with_adc():
+def test_multiview_without_a_cap_and_with_full_pruning_prunes_like_adc():
     params = few([1e-4] * 4, [0.001, 0.002, 0.9, 0.5])
     state = planted([0] * 4, [0.0] * 4, [0.0] * 4)
     edit, _ = Planted(cap_opacity=1, prune_share=1).densify(context(params=params), state)
@@ -194,7 +194,7 @@ def test_opacities_are_reset_as_published_and_a_reset_overrides_the_cap():
 
 
 @pytest.mark.parametrize(("total", "every"), [(30_000, 500), (12_000, 200), (3_000, 100)])
-def test_the_interval_between_edits_is_the_published_one(total, every):
+def test_the_interval_between_edits_is_as_published(total, every):
     schedule = Schedule.for_run(total)
     window = MultiViewDensityControl().window(schedule)
     assert (window.densify_from, window.densify_every) == (500, every)
@@ -304,7 +304,7 @@ def counted(method, ctx):
 
 @pytest.mark.parametrize("count", ["render", "running"])
 def test_exactly_the_gaussians_with_wrong_pixels_grow(count):
-    """Photos that are wrong where one Gaussian is blended: it grows, what never meets it not."""
+    """The photos are wrong where one Gaussian is blended. Only Gaussians in these pixels grow."""
     backbone = Vanilla()
     params = backbone.create(sample_scene(), np.random.default_rng(0))
     with torch.no_grad():
@@ -336,7 +336,10 @@ def test_exactly_the_gaussians_with_wrong_pixels_grow(count):
 
 @pytest.mark.parametrize("count", ["render", "running"])
 def test_errors_of_one_regime_are_not_averaged_with_other_regimes(count):
-    """Near photos are wrong, far ones in one pixel: the mean of all says less than near ones."""
+    """Near photos are wrong, and far photos are wrong in one pixel.
+
+    A mean over all photos would be too small.
+    """
     params = parameters_of(backbone := Vanilla())
 
     def wrong(view):
@@ -401,7 +404,7 @@ def test_extra_renders_are_counted_and_the_running_variant_needs_none():
 
 
 def test_no_per_view_data_is_kept_after_its_step():
-    """The count keeps a view's tile lists alive: those of one step at most."""
+    """The pixel count keeps tile lists of a view in memory, at most for one step."""
     setup, state, _ = run_of(2, count="running", share=1.0, steps=4, **EAGER)
     gc.collect()
     before = sum(type(each) is TileLists for each in gc.get_objects())
@@ -429,7 +432,7 @@ def test_a_rasterizer_without_pixel_counts_is_refused():
 
 
 def test_children_take_their_scores_from_their_parent():
-    """Pruning looks at children, too; they have their parent's share in the error."""
+    """Pruning also uses the scores of children. A child has the error share of its parent."""
     plan = Plan(torch.tensor([0, 1, 1]), torch.tensor([False, True, True]), torch.zeros(3).bool())
     params = few([1e-4, 1e-4], [0.5, 0.001])
     state = planted([0, 0], [0.0, 0.0], [0.0, 0.0], error=[0.0, 1.0])

@@ -134,7 +134,7 @@ def test_an_offset_far_outside_the_scene_does_not_grow():
     assert len(grown(tensors, asked, THRESHOLDS, NEAR_CAMERA)) == 0
 
 
-def test_extra_levels_average_over_a_quarter_of_the_threshold_of_the_level():
+def test_an_extra_level_requires_a_mean_gradient_above_a_quarter_of_the_level_threshold():
     rng = np.random.default_rng(3)
     tensors, asked = parameters(rng, 50), request(rng, 50)
     asked.eligible[:5] = False
@@ -254,7 +254,7 @@ def test_new_anchors_start_with_the_size_of_their_cells():
 
 
 @pytest.mark.parametrize(("total", "mode"), [(40_000, "scaled"), (30_000, "absolute")])
-def test_schedule_times_are_the_published_ones_at_the_published_length_or_on_request(total, mode):
+def test_schedule_times_are_as_published_at_the_published_length_or_on_request(total, mode):
     schedule = OctreeControl().window(Schedule.for_run(total, mode))
     assert schedule.lr_until == 40_000
     edits = [step for step in range(1, 40_001) if schedule.densifies(step)]

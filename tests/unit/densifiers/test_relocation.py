@@ -78,7 +78,7 @@ def test_copies_of_copies_share_the_opacity_twice():
     assert twice.scale.tolist() == pytest.approx([first_scale, factor, factor])
 
 
-def test_shares_are_clipped_and_more_than_51_copies_count_as_51():
+def test_opacity_shares_are_clipped_and_more_than_51_copies_count_as_51():
     index = torch.cat([torch.zeros(200, dtype=torch.int64), torch.tensor([1, 1, 2, 2])])
     pool = Pool.of(numbers(0.9, 0.001, 1.0)).copied(index, 0.005)
     assert pool.opacity[0].item() == pytest.approx(published(0.9, 51)[0])

@@ -89,7 +89,7 @@ def assert_same(one, other):
 
 
 def test_plugin_states_follow_the_run_to_its_device(tmp_path):
-    """The device `meta` holds no numbers, and no machine lacks it."""
+    """Use the device `meta`, because it exists on every machine."""
     config = RunConfig(steps=10, schedule_unit="steps", densify_from=1, densify_until=9)
     setup = assemble(config, sample_scene(), "none")
     state = first_state(setup)

@@ -128,7 +128,7 @@ def share_of(ctx, index, kind, mask=None):
 @pytest.mark.parametrize("kind", ["ssim", "l1"])
 @pytest.mark.parametrize("backbone", [Vanilla(), Bright()], ids=["harmonics", "two per primitive"])
 @pytest.mark.parametrize("rasterizer", ["torch", "numba"])
-def test_the_error_share_is_the_largest_over_views_of_weight_times_error(
+def test_the_error_share_of_a_gaussian_is_its_largest_share_over_the_sampled_views(
     kind, backbone, rasterizer
 ):
     ctx = context(backbone=backbone, rasterizer=rasterizer)
@@ -139,7 +139,7 @@ def test_the_error_share_is_the_largest_over_views_of_weight_times_error(
 
 
 @pytest.mark.parametrize("kind", ["ssim", "l1"])
-def test_masked_pixels_have_no_error(kind):
+def test_error_shares_ignore_masked_pixels(kind):
     mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     mask[4:12, 5:20] = True
     ctx = context(mask=mask)
@@ -226,7 +226,7 @@ def test_decreased_opacities_are_finite_and_none_increases():
 
 
 @pytest.mark.parametrize(("mode", "total"), [("scaled", 30_000), ("absolute", 7_000)])
-def test_density_control_ends_at_27_000_without_resets(mode, total):
+def test_density_control_ends_at_step_27_000_without_opacity_resets(mode, total):
     schedule = Schedule.for_run(total, mode)
     window = RevisingDensification().window(schedule)
     assert (window.densify_from, window.densify_until) == (500, 27_000)

@@ -51,7 +51,7 @@ def test_the_conflict_rate_is_undefined_without_counted_pairs():
     assert np.isnan(found.per_pair)
 
 
-def test_the_gradient_ratio_is_a_ratio_of_means():
+def test_the_near_to_far_gradient_ratio_is_a_ratio_of_means():
     ratio = gradient_ratio(np.array([4.0, 36.0, 1.0, 9.0]), NEAR)
     assert ratio.of_means == pytest.approx((2 + 6) / (1 + 3))
     assert ratio.median == pytest.approx(2.0)
@@ -64,13 +64,13 @@ def test_zero_gradients_count_in_the_means_and_form_no_pairs():
 
 
 @pytest.mark.parametrize("squared", [[4.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]])
-def test_zero_far_gradients_have_no_ratio(squared):
+def test_without_nonzero_far_gradients_the_gradient_ratio_is_undefined(squared):
     ratio = gradient_ratio(np.array(squared), NEAR)
     assert np.isnan(ratio.of_means)
     assert np.isnan(ratio.median)
 
 
-def test_ratios_of_different_units_are_joined_by_their_geometric_mean():
+def test_ratios_are_averaged_by_their_geometric_mean():
     assert geometric_mean((2.0, 8.0)) == pytest.approx(4.0)
     assert np.isnan(geometric_mean((2.0, float("nan"))))
 
@@ -108,7 +108,7 @@ def test_without_a_fitted_line_the_exponent_is_nan(squared, distances):
     assert np.isnan([found.value, found.interval.low, found.interval.high]).all()
 
 
-def test_zero_gradients_and_zero_distances_are_left_out():
+def test_the_exponent_fit_leaves_out_zero_gradients_and_zero_distances():
     distances = np.array([0.0, 1.0, 2.0, 4.0, 8.0, 16.0])
     squared = np.array([5.0, 1.0, 0.25, 0.0625, 0.015625, 0.0])
     found = distance_exponent(squared, distances)
@@ -123,7 +123,7 @@ def opposing(distances):
     return rows @ rows.T
 
 
-def test_conflict_that_grows_with_the_difference_of_distances_is_found():
+def test_conflict_that_grows_with_the_difference_of_camera_distances_is_found():
     distances = np.geomspace(1.0, 20.0, 16)
     found = conflict_by_distance(opposing(distances), distances, np.random.default_rng(0))
     assert found.correlation > 0.5
@@ -152,7 +152,7 @@ def test_constant_conflict_has_no_correlation(gramian):
 
 
 @pytest.mark.parametrize("views", [4, 6, 8])
-def test_an_equally_good_permutation_counts_despite_rounding_of_its_sum(views):
+def test_permutations_that_equal_the_observed_statistic_count_despite_rounding(views):
     # One pair conflicts, the nearest camera with the farthest one: no other is as far apart.
     pairs, values = views * (views - 1) / 2, []
     for seed in range(20):
@@ -167,7 +167,7 @@ def test_an_equally_good_permutation_counts_despite_rounding_of_its_sum(views):
     assert np.mean(values) == pytest.approx(share, abs=3 * np.sqrt(share / 499 / 20) + 1 / 500)
 
 
-def test_pairs_with_equal_distances_have_equal_ranks():
+def test_pairs_of_views_with_equal_distances_have_equal_ranks():
     # Two rings whose radii differ by rounding, in conflict between them.
     radii = np.repeat([1.0, 3.0], 8) * (1 + 1e-15 * np.random.default_rng(0).normal(size=16))
     sides = np.repeat([1.0, -1.0], 8)

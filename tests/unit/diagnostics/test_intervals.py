@@ -40,7 +40,7 @@ def test_intervals_contain_the_true_value_with_the_stated_coverage(kind, dimensi
     assert (held > 0.95 - SLACK).all()
 
 
-def test_intervals_are_not_too_wide():
+def test_confidence_intervals_are_not_too_wide():
     # An interval that held everything would pass the test above.
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(24, 300))
@@ -82,7 +82,7 @@ def test_coverage_of_the_hard_cases_is_within_the_accepted_range(
 
 @pytest.mark.parametrize("isotropic", [True, False])
 def test_the_variance_assumed_at_the_true_gap_agrees_with_normal_theory(isotropic):
-    """The variance that the pivot assumes at the true gap, on average, against that of normals."""
+    """Compare the mean variance that the pivot assumes at the true gap with normal theory."""
     rng = np.random.default_rng(1)
     scales = np.ones(30) if isotropic else 1.0 / np.sqrt(1.0 + np.arange(30))
     # The gap lies where gradients vary least.
@@ -122,7 +122,7 @@ def ends(rows, near, **options):
 
 
 @pytest.mark.parametrize("scale", [1e-25, 1e25])
-def test_intervals_scale_with_the_squared_gradients(scale):
+def test_confidence_intervals_scale_with_the_squared_gradients(scale):
     rows, near = sample()
     expected = ends(rows, near) * np.array([[scale**2], [scale**2], [1.0]])
     np.testing.assert_allclose(ends(scale * rows, near), expected, rtol=1e-5)
@@ -139,7 +139,7 @@ def test_a_rotation_of_the_gradients_does_not_change_the_intervals():
     np.testing.assert_allclose(ends(rows @ rotation, near), ends(rows, near), rtol=1e-5)
 
 
-def test_intervals_contain_their_estimates():
+def test_confidence_intervals_contain_their_estimates():
     rows, near = sample()
     assert (ends(rows, near) == ends(rows, near)).all()
 
@@ -155,7 +155,7 @@ def test_estimates_are_inside_their_intervals_if_possible(seed):
     assert found.between.low >= 0.0
 
 
-def test_only_a_wide_gap_has_an_interval_above_zero():
+def test_only_a_wide_gap_between_groups_has_an_interval_above_zero():
     rows, near = sample(shift=3.0)
     assert ends(rows, near)[1, 0] > 0.0
     rows, near = sample(shift=0.0)
@@ -163,7 +163,7 @@ def test_only_a_wide_gap_has_an_interval_above_zero():
 
 
 def test_an_estimate_far_below_zero_has_no_interval():
-    """Groups with the same views, whose means lie nearer than those of any two samples."""
+    """Both groups contain the same views, so their means are equal."""
     rows = np.tile(np.random.default_rng(0).normal(size=(12, 300)), (2, 1))
     gramian, groups = rows @ rows.T, Groups(np.arange(24) < 12)
     found = split_intervals(gramian, groups, np.random.default_rng(0))

@@ -86,7 +86,7 @@ def test_the_adam_metric_is_missing_before_the_first_step(model):
     assert measure(model, VIEWS, np.random.default_rng(0)).adam is None
 
 
-def test_a_probe_does_not_change_the_model(model):
+def test_a_gradient_probe_does_not_change_the_model(model):
     before = {name: tensor.detach().clone() for name, tensor in model.parameters.items()}
     moments = {name: tensor.clone() for name, tensor in model.adam.exp_avg_sq.items()}
     measure(model, VIEWS, np.random.default_rng(0))
@@ -151,7 +151,7 @@ def plan(per_group=12, seed=0, grouping="radial"):
     return plan_probe(sample_scene(), grouping, labels, per_group, seed)
 
 
-def test_a_probe_plan_samples_equally_many_near_and_far_views():
+def test_the_plan_of_a_gradient_probe_samples_equally_many_near_and_far_views():
     found = plan(3)
     assert len(found.views) == 6
     assert found.near(found.views).sum() == 3
@@ -159,7 +159,7 @@ def test_a_probe_plan_samples_equally_many_near_and_far_views():
     assert len({plan(3, seed).views for seed in range(8)}) > 1
 
 
-def test_a_probe_plan_distinguishes_near_from_far_for_any_label_names():
+def test_the_plan_of_a_gradient_probe_distinguishes_near_from_far_for_any_labels():
     scene = sample_scene()
     labels = tuple("b" if view.regime == "near" else "a" for view in scene.train_views)
     found = plan_probe(scene, "lists", labels, 12, 0)
@@ -169,12 +169,12 @@ def test_a_probe_plan_distinguishes_near_from_far_for_any_label_names():
 @pytest.mark.parametrize(
     "labels", [("all",) * 9, ("near",) * 8 + ("far",)], ids=["one group", "one view"]
 )
-def test_a_probe_plan_needs_two_groups_of_two_views(labels):
+def test_the_plan_of_a_gradient_probe_needs_two_groups_of_two_views(labels):
     with pytest.raises(UserError, match="two"):
         plan_probe(sample_scene(), "lists", labels, 12, 0)
 
 
-def test_the_table_has_a_row_per_metric_and_block(model):
+def test_the_table_of_a_gradient_probe_has_a_row_per_metric_and_block(model):
     measurement = measure(model, plan().views, np.random.default_rng(0))
     rows = table(measurement, plan(), distances_of(model.scene), 0)
     blocks = [*measurement.blocks, "opacities+f_dc", ALL]
@@ -186,7 +186,7 @@ def test_the_table_has_a_row_per_metric_and_block(model):
     assert whole["sigma_w2"] == pytest.approx(parts)
 
 
-def test_the_table_is_the_same_on_every_call(model):
+def test_a_repeated_gradient_probe_gives_the_same_table(model):
     def rows():
         measurement = measure(model, plan().views, np.random.default_rng(0))
         return table(measurement, plan(), distances_of(model.scene), 0)
@@ -194,7 +194,7 @@ def test_the_table_is_the_same_on_every_call(model):
     assert str(rows()) == str(rows())
 
 
-def test_one_probe_is_evaluated_for_every_grouping(model):
+def test_one_gradient_probe_is_evaluated_for_every_grouping(model):
     measurement = measure(model, plan().views, np.random.default_rng(0))
     rows = grouping_rows(model.scene, measurement, 0)
     read = {row["grouping"] for row in rows if not row["note"]}
@@ -206,7 +206,7 @@ def test_one_probe_is_evaluated_for_every_grouping(model):
     assert first["rho"] == own["rho"]
 
 
-def test_camera_quantities_are_reported_with_their_number():
+def test_camera_quantities_are_reported_with_the_number_of_views():
     rows = camera_rows(sample_scene())
     assert [str(row["quantity"]).split(" ")[0] for row in rows] == ["height", "log", "log"]
     assert {row["views"] for row in rows} == {len(sample_scene().train)}
@@ -219,17 +219,19 @@ def test_camera_quantities_are_reported_with_their_number():
     ("every", "total", "expected"),
     [(5, 20, [5, 10, 15, 20]), (5, 22, [5, 10, 15, 22]), (7, 20, [7, 20]), (30, 20, [20])],
 )
-def test_probes_are_evenly_spaced_and_the_last_one_is_at_the_end(every, total, expected):
+def test_gradient_probes_are_evenly_spaced_and_the_last_is_at_the_end_of_the_run(
+    every, total, expected
+):
     watch = Watch(plan(), every, total, 0)
     assert [step for step in range(1, total + 1) if watch.due(step)] == expected
 
 
-def test_a_watch_without_a_probe_cannot_write_a_report():
+def test_a_report_is_refused_if_gradients_were_never_probed():
     with pytest.raises(UserError, match="never probed"):
         Watch(plan(), 5, 20, 0).report(sample_scene(), "nothing")
 
 
-def test_probe_tables_are_read_back_as_written(tmp_path):
+def test_tables_of_gradient_probes_are_read_back_as_written(tmp_path):
     rows = [{"step": 1, "b": 0.25, "c": "x"}, {"step": 2, "b": float("inf"), "d": "y"}]
     write_table(tmp_path / "t.csv", rows)
     found = read_probes(tmp_path / "t.csv")
@@ -239,7 +241,7 @@ def test_probe_tables_are_read_back_as_written(tmp_path):
 
 
 @pytest.mark.parametrize("line", ["1,2,3", "1", "x,2", ",2", '1,"2', "\0"])
-def test_a_damaged_table_of_probes_gives_one_error(line, tmp_path):
+def test_a_damaged_table_of_gradient_probes_gives_one_error(line, tmp_path):
     (tmp_path / "t.csv").write_text(f"step,a\n{line}\n")
     with pytest.raises(UserError, match=r"table of probes cannot be read(?s:.*)to do"):
         read_probes(tmp_path / "t.csv")

@@ -61,7 +61,7 @@ def test_estimates_from_independent_probes_are_unbiased():
     assert np.mean([each.between for each in found]) == pytest.approx((shift**2).sum() / 4)
 
 
-def test_a_probe_of_all_cameras_gives_the_numbers_of_the_paper():
+def test_a_gradient_probe_of_all_cameras_gives_the_numbers_of_the_paper():
     near, far = population()
     found = split(near, far, cameras=(len(near), len(far)))
     assert found.within == pytest.approx((plain_variance(near) + plain_variance(far)) / 2)
@@ -120,7 +120,7 @@ def test_the_estimate_of_sigma_b_is_not_clipped_at_zero():
     assert min(found) < 0 < max(found)
 
 
-def test_zero_gradients_have_no_ratio():
+def test_zero_gradients_have_no_variance_ratio():
     found = split(np.zeros((3, 4)), np.zeros((3, 4)))
     assert (found.within, found.between) == (0.0, 0.0)
     assert np.isnan(found.ratio)
@@ -133,7 +133,7 @@ def test_a_group_with_one_view_is_a_user_error(sizes):
 
 
 @pytest.mark.parametrize("shares", [(0.5, 0.5), (0.7, 0.3)])
-def test_the_noise_scale_is_variance_divided_by_the_squared_mean(shares):
+def test_the_noise_scale_is_the_gradient_variance_divided_by_the_squared_mean(shares):
     near, far = population()
     rows = np.concatenate([near, far])
     census = groups(len(near), len(far), cameras=(len(near), len(far)), shares=shares)

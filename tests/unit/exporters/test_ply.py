@@ -336,7 +336,7 @@ def test_extreme_opacities_and_scales_stay_finite():
     torch.testing.assert_close(opacities[:3], torch.tensor([0.0, 1.0, 0.5]), atol=1e-7, rtol=0)
 
 
-def test_plain_colours_become_band_zero():
+def test_rgb_colours_are_exported_as_sh_band_zero():
     colors = torch.rand(30, 3)
     after = SplatCloud.from_gaussians(
         gaussians(colors=colors, sh_dc=None, sh_rest=None, sh_degree=0)

@@ -97,7 +97,7 @@ def test_an_affine_map_is_a_matrix_product(size, seed):
     check_map(image(size, seed), matrix)
 
 
-def test_long_sums_are_exact():
+def test_long_sums_in_the_exposure_gradient_are_exact():
     check_gain(image((160, 240), 3, 0.0, 1.0), torch.tensor([0.5, -0.5, 2.0]))
     check_map(image((160, 240), 3, 0.0, 1.0), torch.eye(3, 4))
 
@@ -115,7 +115,7 @@ def test_the_reference_is_differentiable_except_at_its_corners(stops):
     assert torch.autograd.gradcheck(srgb.with_gain, inputs, eps=1e-7, rtol=1e-3)
 
 
-def test_decoding_inverts_the_srgb_curve_and_has_known_values():
+def test_decoding_to_linear_light_inverts_the_srgb_curve_and_has_known_values():
     values = torch.linspace(-1, 3, 401, dtype=torch.float64)
     assert torch.allclose(srgb.encoded(srgb.decoded(values)), values, atol=1e-6)
     # IEC 61966-2-1: 18 % grey, and the ends.

@@ -60,7 +60,9 @@ def test_initial_values_differ_by_the_measured_stops(model, stops, monkeypatch):
 @pytest.mark.parametrize("model", MODELS, ids=NAMES)
 @settings(max_examples=40, deadline=None)
 @given(STOPS, st.floats(-6, 6))
-def test_a_neutral_mean_keeps_the_differences_between_photos(model, stops, level):
+def test_projection_to_a_neutral_mean_keeps_exposure_differences_between_photos(
+    model, stops, level
+):
     values = model.of_stops(torch.tensor(stops).double() + level)
     found = model.project({"x": values})["x"]
     assert torch.allclose(found.double().mean(dim=0), neutral(model), atol=ROUNDING)
@@ -70,7 +72,7 @@ def test_a_neutral_mean_keeps_the_differences_between_photos(model, stops, level
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**16))
 def test_projection_of_affine_maps_keeps_their_relative_maps(seed):
-    """Of general maps, too: A_i composed with the inverse of A_j is what it was."""
+    """A_i composed with the inverse of A_j does not change, even for general affine maps."""
     noise = torch.randn(5, 3, 4, generator=torch.Generator().manual_seed(seed)).double()
     values = Affine().neutral() + 0.1 * noise
     found = Affine().project({"matrix": values})["matrix"].double()
@@ -96,7 +98,7 @@ def test_affine_maps_that_remove_all_colour_have_a_finite_neutral_mean(left):
 
 
 @pytest.mark.parametrize("model", MODELS, ids=NAMES)
-def test_values_can_be_shifted_from_one_level_to_another(model):
+def test_exposure_values_can_be_shifted_from_one_level_to_another(model):
     values, start, end = (model.of_stops(torch.tensor(s).double())
                           for s in ([-4.0, 0.0, 4.0], -4.0, 1.0))  # fmt: skip
     found = model.shift(model.parameter, values, start, end)

@@ -91,7 +91,7 @@ def test_photos_of_equal_exposure_do_not_differ_even_if_few_points_join_them(joi
     assert not judged(two_groups(joining, **errors, seed=seed)).differ
 
 
-def test_a_single_outlier_photo_does_not_decide():
+def test_a_single_outlier_photo_does_not_decide_that_exposures_differ():
     seen = two_groups(joining=1_000, outliers=0.0)
     off = seen.stops - 1.3 * (seen.photos == NEAR)
     gains = judged(replace(seen, stops=off))
@@ -224,7 +224,7 @@ def test_a_subset_of_many_photos_decides_the_gains():
     assert deciding_gains(few) is training_gains(few)
 
 
-def test_a_part_of_many_observations_is_used(monkeypatch):
+def test_only_a_subset_of_many_observations_is_used(monkeypatch):
     scene = grey_scene([0.1, 0.2, 0.4])
     module = "crossgrad_plugins.exposures.tracks.observations._MOST"
     monkeypatch.setattr(module, 60)
@@ -244,7 +244,7 @@ def test_gains_of_a_scene_are_computed_once_and_released_with_the_scene():
     assert gone() is None
 
 
-def test_auto_selects_a_gain_if_the_rule_requires_it_and_reports_the_reason():
+def test_exposure_auto_selects_a_gain_by_the_rule_and_reports_the_reason():
     fitted_on = Auto().fitted_to(grey_scene([0.1, 0.2, 0.4]))
     assert fitted_on.name == "gain"
     off = Auto().fitted_to(grey_scene([0.2, 0.2, 0.2]))

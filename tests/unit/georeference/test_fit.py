@@ -30,7 +30,7 @@ def apart(found, expected, points):
 @settings(max_examples=40)
 @given(SEEDS, st.integers(3, 30), st.floats(0.0, 1.0))
 @example(582, 9, 0.0)  # All residuals were above their own median by rounding.
-def test_an_exact_similarity_is_found(seed, count, flat):
+def test_an_exact_similarity_transform_is_found(seed, count, flat):
     frame, points, measured, _ = case(seed, count, flat=flat)
     fit = fit_similarity(points, measured)
     if isinstance(fit, str):  # Three points may lie on a line.
@@ -75,7 +75,7 @@ def test_outliers_are_left_out_of_the_fit(seed, count):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_nearly_half_of_the_points_may_be_wrong_even_in_the_same_direction(seed):
-    """As photos of one folder whose receiver stood elsewhere."""
+    """An example is one folder of photos whose GPS receiver had a constant offset."""
     _, points, measured, rng = case(seed, 60, noise=0.01)
     frame = case(seed, 60)[0]
     wrong = rng.permutation(60)[:26]

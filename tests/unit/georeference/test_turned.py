@@ -86,7 +86,7 @@ def test_sizes_and_positions_are_in_metres(scale):
 
 
 def test_the_rotation_in_projected_coordinates_follows_the_grid():
-    """Meridian convergence and point scale, by PROJ's own derivatives."""
+    """Compare meridian convergence and point scale with the derivatives of PROJ."""
     gaussians = random_gaussians(5, posed_camera(), sh_degree=3)
     rotation = Rotation.random(random_state=1).as_matrix()
     place = OnEarth(PLACE, Frame3D(rotation, -rotation @ SIMILARITY.offset), "a test")

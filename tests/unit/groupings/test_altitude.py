@@ -40,7 +40,7 @@ def upright(axis):
 
 
 @pytest.mark.parametrize("axis", [(0, 0, 1), (0, 0, -1), (0, -1, 0), (1, 0, 0), (0.6, 0, 0.8)])
-def test_the_up_axis_is_found_from_upright_cameras(axis):
+def test_the_up_axis_is_determined_from_upright_cameras(axis):
     scene = upright(axis)
     found, source = upward(scene)
     assert np.allclose(found, axis)
@@ -56,19 +56,19 @@ def test_cameras_with_all_headings_use_the_flattest_axis(flip, points):
     assert "least variance" in source
 
 
-def test_cancelling_up_axes_are_refused_if_the_user_selected_cameras():
+def test_camera_up_axes_that_cancel_are_refused_if_the_user_selected_cameras():
     with pytest.raises(UserError, match="cancel"):
         upward(nadir(), "cameras")
 
 
-def test_a_given_axis_is_normalised():
+def test_a_given_up_axis_is_normalised():
     found, source = upward(nadir(), (0.0, 0.0, 25.0))
     assert np.allclose(found, (0, 0, 1))
     assert source == "given"
 
 
 @pytest.mark.parametrize("axis", [(0.0, 0.0, 0.0), (float("nan"), 0.0, 1.0)])
-def test_an_axis_without_direction_is_refused(axis):
+def test_an_up_axis_of_length_zero_is_refused(axis):
     with pytest.raises(UserError, match="direction"):
         upward(nadir(), axis)
 
@@ -103,5 +103,5 @@ def test_otsus_threshold_has_the_least_variance_within_groups(seed):
 
 @pytest.mark.parametrize("values", [[2.0], [2.0, 2.0, 2.0]])
 @pytest.mark.parametrize("threshold", [otsu_threshold, gap_threshold])
-def test_values_equal_to_the_threshold_are_on_the_lower_side(values, threshold):
+def test_values_equal_to_the_threshold_belong_to_the_lower_group(values, threshold):
     assert threshold(np.array(values)) == 2.0

@@ -128,7 +128,7 @@ def test_the_fit_of_a_grouping_is_reported(name):
 
 
 @pytest.mark.parametrize("name", ["gmm", "kmeans"])
-def test_restarts_make_the_result_independent_of_the_seed(name):
+def test_restarts_make_the_labels_of_a_grouping_independent_of_the_seed(name):
     rng = np.random.default_rng(2)
     centers = [*rng.normal(size=(12, 3)), *(rng.normal(size=(5, 3)) + np.array([0, 9, 20]))]
     scene = posed_scene([posed_view(p, f"{i:02}.png") for i, p in enumerate(centers)])
@@ -144,13 +144,13 @@ def on_a_line(*distances):
     return posed_scene(views)
 
 
-def test_radial_puts_ties_at_the_median_near():
+def test_the_radial_grouping_labels_ties_at_the_median_near():
     scene = on_a_line(1.0, 2.0, 2.0, 2.0, 5.0)
     labels = Radial().fit(scene, np.random.default_rng(0)).labels(scene.views)
     assert labels == ("near",) * 8 + ("far",) * 2
 
 
-def test_radial_refuses_ties_that_leave_far_empty():
+def test_the_radial_grouping_refuses_ties_that_leave_the_far_group_empty():
     scene = on_a_line(1.0, 2.0, 2.0, 2.0)
     with pytest.raises(UserError, match="near: 8, far: 0"):
         Radial().fit(scene, np.random.default_rng(0))
@@ -169,27 +169,27 @@ def test_terciles_have_equal_shares():
     assert [labels.count(name) for name in ("near", "middle", "far")] == [6, 6, 6]
 
 
-def test_anchors_put_thirty_percent_on_either_side():
+def test_the_anchors_grouping_labels_thirty_percent_near_and_thirty_percent_far():
     scene = on_a_line(*np.linspace(1.0, 2.0, 10))
     labels = Anchors().fit(scene, np.random.default_rng(0)).labels(scene.views)
     assert [labels.count(name) for name in ("near", "middle", "far")] == [6, 8, 6]
 
 
-def test_anchors_work_without_a_middle_group():
+def test_the_anchors_grouping_works_without_a_middle_group():
     scene = posed_scene([posed_view((0, 0, 0), "a.png"), posed_view((1, 0, 0), "b.png")])
     three = posed_scene([*scene.views, posed_view((5, 0, 0), "c.png")])
     labels = Anchors(share=0.5).fit(three, np.random.default_rng(0)).labels(three.views)
     assert set(labels) == {"near", "far"}
 
 
-def test_kmeans_calls_the_inner_cluster_near():
+def test_the_kmeans_grouping_labels_the_inner_cluster_near():
     views = [posed_view((x, 0, 0), f"{x}.png") for x in (0.0, 0.1, 0.2, 0.3, 9.0)]
     scene = posed_scene(views)
     labels = KMeans().fit(scene, np.random.default_rng(0)).labels(scene.views)
     assert labels == ("near",) * 4 + ("far",)
 
 
-def test_gmm_recovers_a_mixture():
+def test_the_gmm_grouping_recovers_a_mixture():
     low = np.exp(norm.ppf((np.arange(30) + 0.5) / 30) * 0.2)
     high = np.exp(2.0 + norm.ppf((np.arange(15) + 0.5) / 15) * 0.1)
     scene = on_a_line(*low, *high)

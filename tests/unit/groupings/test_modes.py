@@ -61,7 +61,7 @@ def test_a_split_of_two_modes_of_distances_is_not_noted(grouping):
     assert notes(grouping, layout("city_hybrid")) == ()
 
 
-def test_modes_of_heights_are_tested_along_the_axis_that_splits_them():
+def test_modes_of_heights_are_tested_along_the_axis_of_the_grouping():
     one = at_heights(np.random.default_rng(0).normal(size=40))
     (note,) = notes("altitude", one)
     assert "the bimodality of the height is 0." in note
@@ -83,21 +83,21 @@ def test_groupings_of_more_than_one_quantity_are_not_tested_for_modes(grouping):
 
 
 @pytest.mark.parametrize("size", [4, 6, 8, 9])
-def test_small_samples_of_two_modes_are_not_noted_as_one_mode(size):
+def test_a_split_of_few_cameras_with_two_modes_is_not_noted(size):
     assert notes("altitude", at_heights([0.0, 10.0] * (size // 2) + [0.0] * (size % 2))) == ()
 
 
-def test_small_samples_of_one_mode_are_noted():
+def test_a_split_of_few_cameras_with_one_mode_is_noted():
     (note,) = notes("altitude", at_heights([0.0, 1.9, 2.0, 2.0, 2.1, 4.0]))
     assert "over 6 training views" in note
 
 
 @pytest.mark.parametrize("heights", [[1.0, 2.0, 3.0], [1.0] * 12])
-def test_altitude_notes_are_empty_without_enough_evidence(heights):
+def test_altitude_gets_no_note_about_modes_without_enough_evidence(heights):
     assert notes("altitude", at_heights(heights)) == ()
 
 
-def test_a_camera_without_a_value_is_ignored():
+def test_a_camera_without_a_value_is_ignored_by_the_test_for_modes():
     views = [*layout("city_unimodal").views]
     middle = np.mean([view.camera.center.numpy() for view in views], axis=0)
     scene = posed_scene([*views, posed_view(middle, "middle.png")])
@@ -124,7 +124,7 @@ def test_a_third_party_grouping_is_tested_for_modes():
     assert "the number of points" in note
 
 
-def test_the_note_about_one_mode_is_a_note_of_the_run():
+def test_the_note_about_one_distance_mode_is_recorded_in_the_run():
     settings = {"steps": 5, "sampler": {"name": "near-far"}}
     scene = replace(layout("city_unimodal"), points=sample_scene().points)
     near_far = assemble(RunConfig.model_validate(settings), scene, "none")

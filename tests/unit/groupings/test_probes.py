@@ -53,7 +53,7 @@ def test_a_view_without_points_gets_the_label_of_the_nearest_camera(place, label
 
 
 @pytest.mark.parametrize("depths", [(1, 1.1, 1.2, 1.3, 1.4, 1.5, 9, 10), (1, 2, 7, 8, 9, 10, 11)])
-def test_otsu_cuts_at_the_gap_and_the_median_in_the_middle(depths):
+def test_the_otsu_cut_is_at_the_gap_and_the_median_cut_in_the_middle(depths):
     views = [posed_view((i, -d, 0), f"{i}.png", seen=[i]) for i, d in enumerate(depths)]
     scene = posed_scene(views, [(i, 0, 0) for i in range(len(depths))])
     near = [d < 5 for d in depths]
@@ -75,7 +75,7 @@ def test_the_focal_length_decides_if_all_cameras_are_at_one_position():
     assert labels == ("far", "near", "near", "far")
 
 
-def test_the_conflict_signature_starts_with_the_radial_split_without_a_probe():
+def test_without_a_gradient_probe_the_conflict_signature_is_the_radial_split():
     scene = names("a.png", "b.png", "c.png", "d.png")
     rule = ConflictSignature(at=7).fit(scene, RNG)
     assert rule.labels(scene.views) == Radial().fit(scene, RNG).labels(scene.views)
@@ -110,7 +110,7 @@ def test_the_conflict_signature_ignores_lengths_and_zero_gradients():
     assert labels[0] == labels[2] != labels[1] == labels[3]
 
 
-def test_views_without_a_probe_get_the_label_of_the_nearest_probed_view():
+def test_views_without_probed_gradients_get_the_label_of_the_nearest_probed_view():
     probe = VectorProbe([[1.0]] * 5 + [[-1.0]] * 5)
     scene = names(*(f"{i}.png" for i in range(10)))
     labels = ConflictSignature(cameras=4).fit(scene, RNG, probe).labels(scene.views)
@@ -125,19 +125,19 @@ def test_cosines_are_averaged_over_blocks_with_nonzero_gradients():
     assert np.allclose(mean_cosines(gramians), [[1.0, -1.0], [-1.0, 1.0]])
 
 
-def test_the_cut_is_finite_for_exactly_opposite_gradients():
+def test_the_spectral_cut_is_finite_for_exactly_opposite_gradients():
     cosines = np.array([[1.0, 1.0, -1.0], [1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
     sides = spectral_cut(cosines)
     assert sides[0] == sides[1] != sides[2]
 
 
-def test_folders_become_labels():
+def test_names_of_photo_folders_become_labels():
     scene = names("street/1.png", "aerial/1.png", "street/deep/2.png")
     rule = Lists().fit(scene, RNG)
     assert rule.labels(scene.views) == ("street", "aerial", "street")
 
 
-def test_a_single_folder_is_a_user_error():
+def test_a_grouping_by_folders_refuses_a_single_folder():
     scene = names("a/1.png", "a/2.png")
     with pytest.raises(UserError, match="CSV"):
         Lists().fit(scene, RNG)
@@ -196,6 +196,6 @@ def test_the_spectral_cut_separates_orthogonal_groups(size, seed):
     assert len(set(found)) == 2
 
 
-def test_identical_cameras_are_not_separated():
+def test_the_spectral_cut_does_not_separate_views_with_equal_gradients():
     assert spectral_cut(np.ones((2, 2))).tolist() == [0, 0]
     assert spectral_cut(np.ones((5, 5))).tolist() == [0] * 5

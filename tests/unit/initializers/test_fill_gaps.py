@@ -96,7 +96,7 @@ def test_the_depth_of_a_plane_is_exact_far_from_its_points_and_despite_outliers(
     np.testing.assert_allclose(depth_of(camera, wrong).at(around), true, rtol=0.12)
 
 
-def test_ground_depth_is_at_most_twice_that_of_the_points_and_sky_is_behind_everything():
+def test_ground_depth_is_at_most_twice_the_point_depth_and_sky_is_behind_all_points():
     camera = looking_down(0.0, 0.0, tilt=3.0).camera
     ahead = some_ground(300, (-3.0, 3.0), (4.0, 20.0))
     depths = camera.project(ahead)[1]

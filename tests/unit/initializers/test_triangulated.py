@@ -74,7 +74,7 @@ def test_a_scene_without_points_is_refused_with_the_options_that_add_points(bare
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("backbone", sorted(entries("backbones")))
 def test_every_backbone_can_start_from_triangulated_points(bare, backbone):
-    """The points have no sizes and opacities of their own: the backbone has to find some."""
+    """Triangulated points have no sizes and opacities, so the backbone must choose them."""
     chosen = {"backbone": {"name": backbone}, "initializer": {"name": "triangulated", "views": 4}}
     setup = assemble(RunConfig(scene="somewhere", steps=2, threads=1, **chosen), bare, "colmap")
     state = first_state(setup)

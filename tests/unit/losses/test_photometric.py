@@ -198,7 +198,7 @@ def test_the_reference_gradient_agrees_with_finite_differences(kept):
     assert torch.autograd.gradcheck(lambda x: l1_ssim_loss(x, target, kept), image, fast_mode=True)
 
 
-def test_the_window_is_a_normalised_gaussian():
+def test_the_ssim_window_is_a_normalised_gaussian():
     window = gaussian_window()
     assert window.sum().item() == pytest.approx(1, abs=1e-15)
     assert (window[6] / window[5]).item() == pytest.approx(np.exp(-1 / (2 * 1.5**2)))
@@ -238,7 +238,10 @@ def test_invalid_shapes_are_refused(image, target, mask):
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("name", CASES)
 def test_the_analytic_gradient_agrees_with_autograd(name, masked):
-    """What a GPU computes: in float64 to its rounding, in float32 as near as autograd in it."""
+    """Test the formula of the GPU loss.
+
+    In float32, its error must not exceed the error of autograd.
+    """
     image, target, _ = CASES[name]
     mask = random_mask(image.shape[:2]) if masked else None
     value, gradient = loss_and_gradient(l1_ssim_loss, image.double(), target.double(), mask)
@@ -260,7 +263,7 @@ def test_the_analytic_gradient_agrees_with_autograd(name, masked):
 @pytest.mark.parametrize("ssim_weight", [0.0, 1.0])
 @pytest.mark.parametrize("kept", [None, "none", "one"])
 def test_the_analytic_gradient_is_correct_at_the_ends_of_its_options(ssim_weight, kept):
-    """What does not count may be anything."""
+    """Masked pixels may have any value."""
     image, target = BLURRED.double(), NATURAL.double()
     mask = None if kept is None else torch.zeros(image.shape[:2], dtype=torch.bool)
     if mask is not None:
@@ -282,7 +285,7 @@ def test_the_analytic_gradient_of_equal_images_is_zero(image):
 
 
 def test_the_gpu_loss_multiplies_its_gradient_by_the_upstream_gradient():
-    """On the CPU here: what comes from above is a factor, of any sign."""
+    """Run on the CPU. The upstream gradient is a factor of any sign."""
     image = BLURRED.clone().requires_grad_()
     loss = _DeviceLoss.apply(image, NATURAL, None, 0.2)
     (found,) = torch.autograd.grad(-3.0 * loss, image)

@@ -91,6 +91,6 @@ def test_a_fully_masked_image_has_no_metric_value():
 
 
 @pytest.mark.parametrize("kind", [ColorCorrectedPSNR, ColorCorrectedSSIM])
-def test_the_definition_in_the_results_states_the_fitted_map(kind):
+def test_the_metric_definition_in_the_results_states_the_fitted_colour_map(kind):
     told = kind().described().definition
     assert "affine" in told and "least squares" in told and "photo of the view" in told

@@ -75,12 +75,12 @@ def test_plain_lines_are_printed_after_the_interval(
     assert steps == ["step 996", "step 998", "step 1000"]
 
 
-def test_quiet_prints_nothing(capsys: pytest.CaptureFixture[str]):
+def test_the_quiet_option_prints_no_progress(capsys: pytest.CaptureFixture[str]):
     run_with(Progress(level="quiet"))
     assert capsys.readouterr() == ("", "")
 
 
-def test_verbose_also_prints_density_changes(capsys: pytest.CaptureFixture[str]):
+def test_the_verbose_option_also_prints_density_changes(capsys: pytest.CaptureFixture[str]):
     run_with(Progress(level="verbose"))
     lines = capsys.readouterr().err.splitlines()
     assert "- no masks" in lines
@@ -88,7 +88,7 @@ def test_verbose_also_prints_density_changes(capsys: pytest.CaptureFixture[str])
     assert not any("conflict" in line for line in lines)
 
 
-def test_a_terminal_gets_a_bar(monkeypatch: pytest.MonkeyPatch):
+def test_a_terminal_gets_a_progress_bar(monkeypatch: pytest.MonkeyPatch):
     terminal = Terminal()
     monkeypatch.setattr("sys.stderr", terminal)
     run_with(Progress())
@@ -123,7 +123,7 @@ def test_a_stopped_run_is_reported_as_stopped(capsys: pytest.CaptureFixture[str]
         ((21,), []),
     ],
 )
-def test_changes_of_the_length_give_one_line_at_the_end(capsys, totals, said):
+def test_changes_of_the_run_length_are_reported_in_one_line_at_the_end(capsys, totals, said):
     hook = make_manager({"progress": Progress()}).hook
     run = SimpleNamespace(
         scene=SimpleNamespace(name="s", train=(), test=()),

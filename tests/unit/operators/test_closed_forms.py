@@ -41,12 +41,12 @@ def test_weights_of_two_conflicting_gradients_agree_with_the_formulas(name, ask)
 
 
 @pytest.mark.parametrize("name", ["symmetric", "pcgrad", "gradvac", "soft", "anchors", "chain"])
-def test_gradients_that_agree_are_added(name, ask):
+def test_gradients_without_conflict_are_added(name, ask):
     np.testing.assert_array_equal(ask(name, [[1.0, 0.5], [0.25, 1.0]]).weights, [1.0, 1.0])
 
 
 def test_cagrad_solves_its_optimisation_problem_in_the_plane(ask):
-    """max over |d - g0| <= c |g0| of min g_k.d, against a fine grid of directions."""
+    """Compare max over |d - g0| <= c |g0| of min g_k.d with a fine grid of directions."""
     pairs = (PAIR, np.array([[3.0, 1.0], [-1.0, 2.0]]), np.array([[1.0, 0.0], [-0.9, 0.1]]))
     for rows in pairs:
         mean = rows.mean(axis=0)
@@ -111,7 +111,9 @@ def test_nash_solves_the_bargaining_equation(views, ask):
 
 @pytest.mark.parametrize("views", [2, 3, 4, 7])
 @pytest.mark.parametrize("name", ["mgda", "upgrad", "dualproj"])
-def test_results_of_non_conflicting_operators_conflict_with_no_gradient(name, views, ask):
+def test_results_of_non_conflicting_operators_have_no_negative_dot_product_with_a_gradient(
+    name, views, ask
+):
     for seed in range(10):
         rows = np.random.default_rng(seed).standard_normal((views, 8)) + 0.1
         found = ask(name, rows).result
@@ -147,7 +149,7 @@ def test_anchors_project_only_between_a_near_and_a_far_view(labels, ask):
     np.testing.assert_array_equal(ask("anchors", PAIR, labels=labels).weights, [1, 1])
 
 
-def test_symmetric_projects_three_gradients_on_the_original_partners_in_slot_order(ask):
+def test_symmetric_projects_each_of_three_gradients_against_the_other_original_gradients(ask):
     rows = np.array([[1.0, 0.0], [-1.0, 1.0], [-1.0, -2.0]])
     expected = np.zeros(2)
     for i in range(3):

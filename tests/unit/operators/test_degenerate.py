@@ -98,7 +98,7 @@ def test_results_for_random_gradients_agree_with_fifty_digits(name, family, dtyp
 
 
 def test_the_soft_operator_does_not_change_a_conflict_at_its_threshold():
-    """The cosine is -1/4 exactly, and the rule jumps there."""
+    """The cosine is exactly -1/4, where the rule is discontinuous."""
     rows = [[1.0, 0, 0, 0, 0], [-1.0, 3, 2, 1, 1]]
     for scale in (1.0, 3.0, 7.0):
         assert judged("soft", np.array(rows) * [[scale], [1.0]], torch.float32) <= 8

@@ -105,13 +105,13 @@ def test_aligned_drops_a_view_shorter_than_the_threshold(ask):
 
 
 def test_cagrad_gives_zero_if_a_combination_of_gradients_vanishes(ask):
-    """Three directions of one plane that cancel: g_w = 0, the direction is undefined."""
+    """Three gradients in one plane cancel: g_w = 0, so the direction is undefined."""
     rows = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0]])
     np.testing.assert_array_equal(ask("cagrad", rows).result, [0, 0])
 
 
 @pytest.mark.parametrize("name", ["mgda", "nash", "upgrad", "dualproj", "imtl-g"])
-def test_directions_that_cancel_give_zero(name, ask):
+def test_gradient_directions_that_cancel_give_a_zero_result(name, ask):
     angles = 2 * np.pi * np.arange(3) / 3
     rows = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     np.testing.assert_array_equal(ask(name, rows).result, [0, 0])

@@ -26,12 +26,12 @@ def same(one, other, rows):
     ("name", "factor"),
     [("pcgrad", 1), ("upgrad", 2), ("gradvac", 1), ("anchors", 1), ("soft", 1)],
 )
-def test_operators_equal_symmetric_for_two_views(name, factor, ask):
+def test_operators_equal_the_symmetric_operator_up_to_a_factor_for_two_views(name, factor, ask):
     for rows in pairs():
         same(ask("symmetric", rows), factor * ask(name, rows).weights, rows)
 
 
-def test_a_gate_without_memory_equals_symmetric(ask):
+def test_confgate_without_warmup_equals_symmetric(ask):
     open_gate = build("operators", "confgate", {"warmup": 0})
     for rows in pairs():
         same(ask("symmetric", rows), ask(open_gate, rows).weights, rows)

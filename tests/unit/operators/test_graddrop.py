@@ -24,19 +24,19 @@ def test_graddrop_keeps_the_positive_sign_with_probability_two_thirds_for_two_to
     assert abs(share - 2 / 3) < 4 * np.sqrt(2 / 9 / count)
 
 
-def test_elements_of_equal_sign_are_added_and_zeros_are_kept():
+def test_graddrop_adds_elements_of_equal_sign_and_keeps_zeros():
     found = drop(torch.tensor([1.0, -2.0, 0.0, 0.0]), torch.tensor([3.0, -1.0, 5.0, 0.0]))
     assert found.tolist() == [4.0, -3.0, 5.0, 0.0]
 
 
 @pytest.mark.parametrize("size", [3e38, 1e-45])
-def test_extreme_elements_neither_overflow_nor_vanish(size):
+def test_extreme_gradient_elements_neither_overflow_nor_vanish_in_graddrop(size):
     found = drop(torch.full((1000,), size), torch.full((1000,), -size))
     assert set(found.abs().unique().tolist()) == {float(np.float32(size))}
     assert 400 < int((found > 0).sum()) < 600
 
 
-def test_the_same_generator_gives_the_same_signs():
+def test_graddrop_with_the_same_generator_keeps_the_same_signs():
     g = torch.randn((2, 500), generator=torch.Generator().manual_seed(0))
     assert torch.equal(drop(*g), drop(*g))
     assert not torch.equal(drop(*g), drop(*g, seed=1))

@@ -46,7 +46,7 @@ def test_the_anchors_operator_requires_two_views():
 
 @pytest.mark.parametrize("name", ["sum", "symmetric", "upgrad", "graddrop", "chain"])
 @pytest.mark.parametrize("views", [1, 2, 5])
-def test_other_operators_accept_any_views(name, views):
+def test_operators_other_than_anchors_accept_any_views(name, views):
     assert objections(name, "random", views=views) == []
 
 

@@ -47,7 +47,7 @@ def test_every_operator_obeys_every_law(name, law):
 def test_results_for_any_gradients_are_finite_and_independent_of_scale(
     name, data, ask, gradient_rows
 ):
-    """Finite, bounded where promised, the same for gradients 2^60 times as long or short."""
+    """Results are finite, bounded if promised, and independent of a factor of 2^60 or 2^-60."""
     operator = build("operators", name, {})
     rows = data.draw(gradient_rows())
     if not operator.views.admits(len(rows)):

@@ -58,7 +58,7 @@ def test_confgate_does_not_project_a_rare_conflict(ask):
 
 
 def test_confgate_low_detects_conflict_sooner_than_v2(ask):
-    """Cosines of about -1 and +1, a few more of the former: P(conflict) wanders around 0.8."""
+    """Cosines are about -1 and +1, and slightly more are -1. P(conflict) stays around 0.8."""
     signs = np.where(np.random.default_rng(0).random(600) < 0.54, -1.0, 1.0)
     gates = {}
     for preset in ("v2", "low"):
@@ -93,7 +93,7 @@ def test_gradnorm_favours_the_group_whose_loss_decreases_slowly(ask):
     assert found.weights[0] > found.weights[1]
 
 
-def test_gradnorm_gives_the_views_of_a_group_one_weight(ask):
+def test_gradnorm_gives_all_views_of_a_group_the_same_weight(ask):
     rows = np.random.default_rng(0).standard_normal((4, 6)) * [[9.0], [1.0], [9.0], [1.0]]
     weights = repeat(ask, "gradnorm", rows, 50).weights
     assert weights[0] == weights[2] < weights[1] == weights[3]

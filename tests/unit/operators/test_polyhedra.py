@@ -23,12 +23,12 @@ def verdict(name, rows, dtype=torch.float32):
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_five_short_rows_give_exact_results(name):
+def test_five_short_gradients_give_exact_results(name):
     assert verdict(name, FIVE).verdict == "ok"
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_integer_rows_give_exact_results(name):
+def test_integer_gradients_give_exact_results(name):
     rng = np.random.default_rng(3)
     for _ in range(12):
         views, size = rng.integers(3, 10), rng.integers(1, 5)
@@ -37,8 +37,8 @@ def test_integer_rows_give_exact_results(name):
         assert finding.verdict in {"ok", "undetermined", "outside"}, (rows, finding)
 
 
-def test_upgrad_near_opposition_does_not_jump_to_zero(ask):
-    """A third gradient keeps a part that conflicts with neither of two almost opposite ones."""
+def test_upgrad_of_nearly_opposite_gradients_does_not_jump_to_zero(ask):
+    """A part of a third gradient conflicts with neither of two almost opposite gradients."""
     lengths = []
     for distance in (1e-4, 1e-5, 3e-6):
         rows = [[1.0, 0.0, 0.0], [-1.0, distance, 0.0], [0.3, -0.9, 0.3]]
@@ -47,7 +47,7 @@ def test_upgrad_near_opposition_does_not_jump_to_zero(ask):
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_weights_of_short_rows_are_finite(name, ask):
+def test_weights_of_short_gradients_are_finite(name, ask):
     rng = np.random.default_rng(0)
     for _ in range(500):
         rows = rng.standard_normal((rng.integers(2, 21), rng.integers(1, 6)))
@@ -66,12 +66,12 @@ NEARLY = [
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 @pytest.mark.parametrize("name", METHODS)
-def test_nearly_cancelling_rows_give_no_wrong_result(name, dtype):
+def test_nearly_cancelling_gradients_give_no_wrong_result(name, dtype):
     for rows in NEARLY:
         assert verdict(name, rows, dtype).verdict in {"ok", "undetermined", "outside"}, rows
 
 
 def test_cagrad_gives_zero_if_two_short_gradients_cancel(ask):
-    """CAGrad between others and two short ones: no level above 0 can be reached by all."""
+    """Two short gradients cancel, so no direction has a positive product with all gradients."""
     rows = np.array([[0.5, 1, 2], [0.2, 4, 1], [0.3, 2, 5], [1e-3, 0, 0], [-1e-3, 0, 0]])
     assert not ask("cagrad", rows).result.any()

@@ -79,13 +79,13 @@ class Absolute(GramianOperator):
 
 
 @pytest.mark.parametrize("dtype", BOTH, ids=str)
-def test_the_search_finds_an_operator_that_is_seldom_slightly_wrong(dtype):
+def test_the_operator_search_finds_an_operator_that_is_seldom_slightly_wrong(dtype):
     (tally,) = search([symmetric_as(SeldomOff())], Extent(rounds=4, dtypes=(dtype,)))
     assert failed(tally)
     assert "u kappa" in tally.failures[0][1]
 
 
-def test_the_search_finds_an_operator_that_is_rarely_nan():
+def test_the_operator_search_finds_an_operator_that_rarely_returns_nan():
     found = run_finite(symmetric_as(SeldomNan()), 20_000)
     assert found.not_finite > 0
     assert "not finite" in as_text([found])
@@ -94,7 +94,7 @@ def test_the_search_finds_an_operator_that_is_rarely_nan():
     assert np.isnan(again).any()
 
 
-def test_the_search_finds_an_operator_with_a_jump():
+def test_the_operator_search_finds_an_operator_with_a_discontinuity():
     (tally,) = search([symmetric_as(Jumps())], Extent(rounds=1, dtypes=(torch.float64,)))
     assert any("moves by" in reason for _, reason in tally.failures)
 
@@ -105,7 +105,7 @@ def test_an_operator_without_a_reference_must_scale_with_the_gradients():
     assert failed(tally)
 
 
-def test_the_correct_operator_passes_the_search():
+def test_the_correct_operator_passes_the_operator_search():
     assert not any(map(failed, search([symmetric_as(Symmetric())], Extent(rounds=8))))
 
 
@@ -155,7 +155,7 @@ def test_gradient_families_reach_their_intended_extremes():
     assert (~FAMILIES["zeros"](rng, 50, 6, 5).any(axis=2)).any()
 
 
-def test_a_failing_case_is_reduced_to_the_rows_that_cause_it():
+def test_a_failing_case_is_reduced_to_the_gradients_that_cause_it():
     class OffForThree(Symmetric):
         def transform(self, gramians, context, state, rng):
             matrices, state = super().transform(gramians, context, state, rng)
@@ -169,7 +169,7 @@ def test_a_failing_case_is_reduced_to_the_rows_that_cause_it():
     assert small.rows.shape[1] <= 2
 
 
-def test_printed_rows_are_read_back_exactly():
+def test_printed_gradients_are_read_back_exactly():
     for dtype in BOTH:
         rows = rounded(FAMILIES["mixed"](np.random.default_rng(5), 1, 4, 3)[0], dtype)
         text = Sample(rows, dtype, "test", 0, 1.0).text()
@@ -193,7 +193,7 @@ def test_printed_rows_are_read_back_exactly():
         *("[" * 5000, f"[[1{'0' * 400},1]]"),
     ],
 )
-def test_rows_that_do_not_form_a_matrix_are_refused(text):
+def test_gradients_that_do_not_form_a_matrix_are_refused(text):
     with pytest.raises(UserError, match="not a matrix"):
         read_rows(text, torch.float32)
 

@@ -75,7 +75,7 @@ def views_of(operator, sampler=None):
         ("pcgrad", {"name": "near-far", "alternating": True}, 1),
     ],
 )
-def test_the_sampler_sets_the_views_if_the_operator_accepts_them(operator, sampler, views):
+def test_the_sampler_sets_the_number_of_views_if_the_operator_accepts_it(operator, sampler, views):
     assert views_of(operator, sampler) == (views, [])
 
 

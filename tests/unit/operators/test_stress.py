@@ -89,7 +89,7 @@ def test_an_operator_without_a_reference_must_be_finite():
 
 
 def test_exact_gramians_have_fifty_digits():
-    """1e8 + 1 - 1e8 in float32 products, and 2^-149 squared."""
+    """Test 1e8 + 1 - 1e8 in float32 products, and 2^-149 squared."""
     tiny = 2.0**-149
     case = short("tiny", [[1e8, 1.0, tiny], [1e8, -1.0, tiny]])
     with mpmath.mp.workdps(50):

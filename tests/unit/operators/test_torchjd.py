@@ -71,9 +71,9 @@ def test_gradvac_follows_the_target_cosines_of_torchjd(beta, ask):
 
 @pytest.mark.parametrize("views", VIEWS)
 def test_mgda_is_at_least_as_good_as_torchjd(views, ask):
-    """Frank and Wolfe's steps shrink slowly: theirs is as far off as it is longer, no further.
+    """The Frank-Wolfe steps of TorchJD shrink slowly, so its result is longer.
 
-    For u the shortest point of a convex set and v any other, |v - u|^2 <= |v|^2 - |u|^2.
+    For the shortest point u of a convex set and any other point v, |v - u|^2 <= |v|^2 - |u|^2.
     """
     theirs = aggregation.MGDAWeighting(epsilon=1e-14, max_iters=1000)
     for rows in gradients(views, 5):
@@ -88,7 +88,7 @@ def test_mgda_is_at_least_as_good_as_torchjd(views, ask):
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("views", VIEWS)
 def test_mgda_agrees_with_torchjd_if_every_view_has_a_positive_weight(views, ask):
-    """Frank and Wolfe's steps converge fast where the shortest point lies well inside."""
+    """The Frank-Wolfe method converges fast if the shortest point is far inside the convex hull."""
     theirs = aggregation.MGDAWeighting(epsilon=1e-16, max_iters=1000)
     compared = 0
     for rows in gradients(views):
@@ -111,7 +111,7 @@ def test_cone_projections_agree_with_torchjd(name, weighting, views, ask):
 @pytest.mark.parametrize("views", VIEWS)
 @pytest.mark.filterwarnings("ignore:Solution may be inaccurate")
 def test_cagrad_agrees_with_torchjd_with_a_tight_solver(views, ask, monkeypatch):
-    """With a tight solver, which warns that it could not get all the way to 1e-15."""
+    """The solver warns that it does not reach its tolerance of 1e-15."""
     solve = partialmethod(cvxpy.Problem.solve, **TIGHT)
     monkeypatch.setattr(cvxpy.Problem, "solve", solve)
     agree("cagrad", aggregation.CAGradWeighting(c=0.5, norm_eps=1e-12), views, ask)
@@ -119,9 +119,9 @@ def test_cagrad_agrees_with_torchjd_with_a_tight_solver(views, ask, monkeypatch)
 
 @pytest.mark.parametrize("views", VIEWS)
 def test_cagrad_is_never_worse_than_torchjd_with_default_solver(views, ask):
-    """With TorchJD's own solver settings the directions differ by its accuracy, about 6e-5.
+    """The default solver of TorchJD is accurate to about 6e-5.
 
-    Both stay within c |g_0| of the mean; theirs never serves the worst-off view better.
+    Both results are within c |g_0| of the mean. TorchJD never serves the worst view better.
     """
     theirs = aggregation.CAGradWeighting(c=0.5, norm_eps=1e-12)
     for rows in gradients(views):

@@ -36,7 +36,7 @@ def factors(modules, sweep, wanted, **more):
 
 @pytest.mark.parametrize("first", ["a", "z"])
 def test_a_changed_grid_uses_its_own_runs_only(modules, tmp_path, first):
-    """Whatever the order of the folders' names, which are hashes."""
+    """The order of folder names must not matter, because the names are hashes."""
     old = write_runs(tmp_path, first, rate_factor=2.0)
     new = write_runs(tmp_path, "m", rate_factor=20.0)
     write_table(tmp_path, new, old)

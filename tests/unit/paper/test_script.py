@@ -36,7 +36,7 @@ def test_a_scene_without_tuning_is_refused(modules):
         modules.paper.with_rates(bad, {"cagrad": "two random views"}, FACTORS)
 
 
-def test_backbones_use_the_methods_and_rates_of_similar_arms(modules):
+def test_backbones_are_combined_with_all_methods_and_use_rates_of_similar_arms(modules):
     plan = modules.data.read_plan()
     methods = [
         Arm(name="one view, 2x stretched", settings={"views": 1, "observers": ["diagnostics"]}),
@@ -72,7 +72,9 @@ def paper(modules, tmp_path):
     return make
 
 
-def test_the_estimate_subtracts_runs_in_packed_tables(paper, planted, modules, capsys):
+def test_the_estimated_time_excludes_finished_runs_in_packed_tables(
+    paper, planted, modules, capsys
+):
     scenes = [f"/scenes/{name}" for name in SCENES[:2]]
     found = paper(scene=scenes, only=["views"])
 

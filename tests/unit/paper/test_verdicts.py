@@ -80,7 +80,7 @@ def test_an_unfinished_sweep_is_not_judged(modules, planted, grid_of):
 
 @pytest.mark.parametrize(("failed", "outcome"), [(1, "holds"), (3, "inconclusive")])
 def test_many_failed_runs_leave_a_claim_undecided(modules, planted, grid_of, failed, outcome):
-    """A whole scene of four, here, that an arm cannot be trained on."""
+    """An arm fails on one of four scenes."""
     sweep = planted("some", {"a": 0.0, "b": 1.0})
     results = modules.runs.read_results({"some": sweep}, {"some": grid_of("ab")})
     gone = sorted(results.runs["b"])[:failed]
@@ -110,7 +110,7 @@ def test_a_scene_that_contradicts_the_other_scenes_leaves_a_claim_undecided(
 
 
 def test_one_sided_statements_are_also_corrected_together(modules):
-    """Each p-value is below 0.05; of six, only the least is after Holm's correction."""
+    """Six p-values are below 0.05. After the correction of Holm, only the smallest one is."""
     rng = np.random.default_rng(0)
     noise = rng.normal(size=9)
     noise = (noise - noise.mean()) / noise.std(ddof=1)
@@ -184,8 +184,11 @@ def test_blocks_are_compared_and_averaged_run_by_run(modules, planted, grid_of):
     assert found[0].figure.startswith("+0.800") and found[2].figure.startswith("0.400")
 
 
-def test_shares_of_the_gap_in_the_papers_tables_contradict_its_text(modules):
-    """The text says 80 to 100 % on four of five scenes; its tables do not."""
+def test_the_tables_of_the_paper_contradict_its_text_about_the_closed_gap(modules):
+    """The text states 80 to 100 % on four of five scenes.
+
+    The tables of the paper show other shares.
+    """
     claims = modules.data.read_claims()
     claim = next(c for s in claims.sections for c in s.claims if c.id == "gap-closed")
     (found,) = answers_of(modules, modules.runs.Results({}, {}), claim)

@@ -112,7 +112,7 @@ def plan_for(scene, **given):
 
 
 @pytest.mark.parametrize("name", MEASURED)
-def test_the_decision_on_modes_matches_the_measured_scenes(name):
+def test_the_decision_on_distance_modes_matches_the_measured_scenes(name):
     choice, separability, ratio, spread, *_ = MEASURED[name]
     found = grouping.modes(evidence_of(name))
     assert found.choice == choice
@@ -179,7 +179,7 @@ def test_settings_of_the_user_are_kept_and_marked_in_the_table(bundled):
     assert planned(mine, scene) == []
 
 
-def test_decisions_become_settings(bundled):
+def test_decisions_of_the_planner_become_settings(bundled):
     config, scene = bundled
     (row,) = planned(config, scene)
     assert (row.setting, row.value, row.override) == ("exposure", "gain", "--exposure none")
@@ -191,7 +191,7 @@ def test_decisions_become_settings(bundled):
     assert json.loads(json.dumps(data)) == data
 
 
-def test_pairs_of_views_are_decided_only_with_a_probe():
+def test_pairs_of_views_are_decided_only_with_a_gradient_probe():
     found = grouping.pairs(evidence_of("city_hybrid"))
     assert found.basis == "default"
     assert "--probe" in found.evidence
@@ -207,7 +207,7 @@ def test_pairs_of_views_are_decided_only_with_a_probe():
         (np.nan, np.nan, np.nan, "default", {}),
     ],
 )
-def test_pairs_of_views_are_decided_by_the_whole_interval(low, rho, high, status, changes):
+def test_pairs_of_views_are_decided_by_the_whole_interval_of_rho(low, rho, high, status, changes):
     probe = Probe(rho=rho, rho_low=low, rho_high=high, noise_scale=50.0, conflict=0.5)
     found = grouping.pairs(evidence_of("city_hybrid", probe))
     assert found.basis == status
@@ -215,7 +215,7 @@ def test_pairs_of_views_are_decided_by_the_whole_interval(low, rho, high, status
     assert not grouping.pairs(evidence_of("city_unimodal", probe)).settings
 
 
-def test_an_estimate_below_zero_without_an_interval_decides_nothing():
+def test_an_estimate_of_rho_below_zero_without_an_interval_decides_nothing():
     found = grouping.pairs(evidence_of("city_hybrid", Probe(rho=-0.0105, conflict=0.5)))
     assert (found.basis, dict(found.settings)) == ("default", {})
     assert "-0.011, 95 % interval none, the estimate is below 0" in found.evidence
@@ -282,7 +282,7 @@ def test_pairs_from_modes_of_unequal_size_are_rejected_because_they_change_the_o
         ({"sampler": {"name": "near-far"}, "backward": "joint"}, "sum"),
     ],
 )
-def test_projection_is_chosen_for_pairs_from_the_sampler_of_the_user(given, choice):
+def test_gradient_projection_is_chosen_for_pairs_from_the_sampler_of_the_user(given, choice):
     assert grouping.operator(evidence_of("city_hybrid", PAIRS_PAY, **given)).choice == choice
 
 
@@ -295,21 +295,21 @@ def test_projection_is_chosen_for_pairs_from_the_sampler_of_the_user(given, choi
         ({"grouping": {"name": "percentile", "q": 20}}, {"name": "percentile", "q": 20}),
     ],
 )
-def test_the_probe_uses_the_groups_of_the_run(given, grouping):
+def test_the_gradient_probe_uses_the_grouping_of_the_run(given, grouping):
     assert evidence_of("city_hybrid", **given).grouping.model_dump() == grouping
 
 
 @pytest.mark.parametrize(
     ("name", "grouping"), [("city_hybrid", "altitude"), ("ochota_kap_hybrid", "footprint")]
 )
-def test_modes_are_separated_by_the_grouping_with_the_clearest_gap(name, grouping):
+def test_distance_modes_are_separated_by_the_grouping_with_the_clearest_gap(name, grouping):
     assert evidence_of(name).grouping.name == grouping
 
 
 @pytest.mark.sampled(5)
 @pytest.mark.parametrize("views", [12, 30, 60, 200])
 @pytest.mark.parametrize("law", ["uniform", "normal", "exponential", "lognormal"])
-def test_distances_without_a_gap_form_one_mode(law, views):
+def test_camera_distances_without_a_gap_form_one_mode(law, views):
     rng = np.random.default_rng(views)
     draw = {
         "uniform": lambda: rng.uniform(0.0, 2.5, views),
@@ -324,7 +324,7 @@ def test_distances_without_a_gap_form_one_mode(law, views):
 
 @pytest.mark.parametrize("views", [12, 30, 60, 200])
 @pytest.mark.parametrize("share", [0.2, 0.5])
-def test_distances_with_a_gap_form_two_modes(share, views):
+def test_camera_distances_with_a_gap_form_two_modes(share, views):
     rng = np.random.default_rng(views)
     far = np.arange(views) < round(share * views)
     found = [modes_at(rng.normal(0.0, 0.07, views) + far) for _ in range(100)]
@@ -336,7 +336,7 @@ def test_distances_with_a_gap_form_two_modes(share, views):
 
 @pytest.mark.parametrize("views", [10, 20, 30, 50, 100])
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_a_tenth_of_the_views_forms_a_mode_on_either_side(views, side):
+def test_a_tenth_of_the_views_is_enough_for_a_near_or_far_mode(views, side):
     far = np.arange(views) < views // 10
     found = modes_at(np.linspace(0.0, 0.1, views) + 2.0 * side * far)
     assert found.two
@@ -344,7 +344,7 @@ def test_a_tenth_of_the_views_forms_a_mode_on_either_side(views, side):
 
 
 @pytest.mark.parametrize("stragglers", [1, 2, 5])
-def test_a_few_outliers_do_not_form_a_mode(stragglers):
+def test_a_few_outlier_cameras_do_not_form_a_distance_mode(stragglers):
     logs = np.random.default_rng(5).normal(0.0, 0.1, 60)
     logs[:stragglers] += 3.0
     assert not modes_at(logs).two
@@ -355,13 +355,15 @@ def test_a_few_outliers_do_not_form_a_mode(stragglers):
     ("conflict_low", "rho_low", "choice"),
     [(0.6, 0.2, "symmetric"), (0.45, 0.2, "sum"), (0.6, 0.0, "sum")],
 )
-def test_projection_requires_pairs_and_conflict_beyond_chance(conflict_low, rho_low, choice):
+def test_gradient_projection_requires_pairs_and_conflict_beyond_chance(
+    conflict_low, rho_low, choice
+):
     probe = Probe(rho=0.5, rho_low=rho_low, rho_high=0.9, conflict=0.7, conflict_low=conflict_low)
     assert grouping.operator(evidence_of("city_hybrid", probe)).choice == choice
     assert grouping.operator(evidence_of("city_unimodal", probe)).choice == "sum"
 
 
-def test_a_failed_probe_decides_nothing():
+def test_a_failed_gradient_probe_decides_nothing():
     probe = Probe(problem="a probe needs at least two training views in each group")
     evidence = evidence_of("city_hybrid", probe)
     for part in (grouping.pairs, grouping.operator):
@@ -413,7 +415,7 @@ def test_a_scene_with_cameras_in_an_orbit_has_one_distance():
     assert not plan.settings
 
 
-def test_a_transparent_render_gets_the_background_of_its_photos():
+def test_the_planner_selects_the_background_with_which_photos_were_blended():
     note = "photos: 40 of 40 photos with transparency: blended over RGB (1.0, 1.0, 1.0)"
     scene = replace(orbit(), notes=(note,))
     assert plan_for(scene).settings == {"background": "white"}
@@ -421,7 +423,7 @@ def test_a_transparent_render_gets_the_background_of_its_photos():
     assert not plan_for(scene, background="black").settings
 
 
-def test_a_street_scene_has_one_mode():
+def test_a_scene_of_street_photos_has_one_distance_mode():
     plan = plan_for(street())
     assert plan.of_part("modes").choice == "one mode, continuous"
     assert plan.of_part("modes").figures["range"] > 3.0
@@ -429,7 +431,7 @@ def test_a_street_scene_has_one_mode():
     assert not plan.settings
 
 
-def test_a_view_without_points_does_not_prevent_pairs():
+def test_a_view_without_points_does_not_prevent_pairs_of_views():
     rng = np.random.default_rng(1)
     cloud = rng.uniform(-1.0, 1.0, (200, 3))
     views = [
@@ -447,7 +449,7 @@ def test_a_view_without_points_does_not_prevent_pairs():
     assert rule.labels(views) == ("near", "far") * 10
 
 
-def test_a_scene_of_street_and_aerial_photos_has_two_modes():
+def test_a_scene_of_street_and_aerial_photos_has_two_distance_modes():
     low = street(15)
     cloud = low.points
     high = [
@@ -604,6 +606,8 @@ def test_the_planner_handles_random_scenes(centers, points, asked, notes):
         (data.held_out, "test_every", 4),
     ],
 )
-def test_data_settings_of_the_user_are_not_decided(decides, setting, value):
+def test_settings_in_the_group_data_given_by_the_user_are_not_changed_by_the_planner(
+    decides, setting, value
+):
     evidence = Evidence(config_of(data={setting: value}), posed_scene([]))
     assert decides(evidence).basis == "given"

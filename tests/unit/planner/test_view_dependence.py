@@ -87,14 +87,14 @@ def test_a_glossy_surface_keeps_the_sh_bands(monkeypatch):
 
 
 @pytest.mark.parametrize("per_point", [2, view_dependence.LEAST_OBSERVATIONS - 1])
-def test_short_tracks_decide_nothing(per_point, monkeypatch):
+def test_short_tracks_decide_nothing_about_sh_bands(per_point, monkeypatch):
     scene = ring()
     found = decided(scene, observed(scene, 0.0, per_point), monkeypatch)
     assert (found.choice, found.basis) == ("3", "default")
     assert found.figures["tracks"] == 0
 
 
-def test_viewing_directions_in_a_narrow_cone_decide_nothing(monkeypatch):
+def test_viewing_directions_in_a_narrow_cone_decide_nothing_about_sh_bands(monkeypatch):
     scene = ring(radius=1.0, height=40.0)
     found = decided(scene, observed(scene, 0.0), monkeypatch)
     assert found.basis == "default"
@@ -110,7 +110,9 @@ def test_viewing_directions_in_a_narrow_cone_decide_nothing(monkeypatch):
         ((500, np.nan, np.nan, np.nan), "3", "default"),
     ],
 )
-def test_the_whole_interval_decides_about_sh_bands(figures, choice, basis, monkeypatch):
+def test_the_whole_interval_of_view_dependence_decides_about_sh_bands(
+    figures, choice, basis, monkeypatch
+):
     measured = view_dependence.ViewDependence(*figures)
     monkeypatch.setattr(view_dependence, "view_dependence", lambda scene: measured)
     found = appearance.degree(Evidence(configured({"scene": "nowhere"}), ring()))

@@ -46,7 +46,7 @@ def decision(scene, **given):
     return view_schedule(Evidence(configured({"scene": "x", "steps": 100, **given}), scene))
 
 
-def test_the_far_first_schedule_is_chosen_if_near_views_look_around():
+def test_the_far_first_schedule_is_chosen_if_only_near_views_look_in_many_directions():
     scene = scene_of(AROUND)
     found = decision(scene)
     assert found.basis == "decided"
@@ -108,7 +108,7 @@ def missing(*_arguments):
 @pytest.mark.parametrize(
     ("name", "value"), [("resolve_entry", lambda _: broken), ("find", missing)]
 )
-def test_a_planner_that_fails_is_called_only_if_a_plan_is_requested(name, value, monkeypatch):
+def test_the_planner_is_called_only_if_a_plan_is_requested(name, value, monkeypatch):
     monkeypatch.setattr(decisions, name, value)
     off = configured({"scene": "x", "steps": 100, "plan": "off"})
     assemble(off, scene_of(AROUND), "colmap")
@@ -132,14 +132,14 @@ def test_a_planned_run_with_many_photos_does_not_count_as_short(photos, short):
 
 
 @pytest.mark.parametrize("height", [20.0, 30.0])
-def test_two_flight_levels_use_the_epoch_sampler(height):
+def test_a_scene_of_two_flight_levels_uses_the_epoch_sampler(height):
     found = decision(scene_of(DOWN, height))
     assert not found.settings
     assert found.choice == "epoch"
     assert "degrees away" in found.evidence
 
 
-def test_a_scene_with_one_mode_uses_the_epoch_sampler():
+def test_a_scene_with_one_distance_mode_uses_the_epoch_sampler():
     views = [posed_view((3 * i, 0, 90.0), f"{i}.png", forward=(0, 0.2, -1)) for i in range(24)]
     found = decision(posed_scene(views, CLOUD))
     assert (found.choice, dict(found.settings)) == ("epoch", {})
@@ -167,7 +167,7 @@ def test_a_small_far_mode_does_not_get_the_far_first_schedule():
     assert found.evidence == "the smaller mode has 33% of the views"
 
 
-def test_far_views_in_all_directions_do_not_differ_in_direction():
+def test_far_views_in_many_directions_do_not_differ_from_near_views_in_direction():
     low = scene_of(AROUND).views[12:]
     ring = [(np.cos(angle), np.sin(angle), 0) for angle in np.linspace(0, 2 * np.pi, 12, False)]
     high = [posed_view((0, 0, 90.0), f"{i}.png", forward=f) for i, f in enumerate(ring)]

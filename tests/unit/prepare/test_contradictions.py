@@ -43,7 +43,7 @@ def test_correct_poses_are_not_contradicted(made):
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_misplaced_photos_are_contradicted(made, count):
-    """Each has its matches with the others against it; what was found before has no vote."""
+    """The matches of a misplaced photo with all other photos contradict its pose."""
     model, path = made
     wrong = numbers(model)[:count]
     for at, number in enumerate(wrong):
@@ -53,8 +53,8 @@ def test_misplaced_photos_are_contradicted(made, count):
     assert all(votes[0] == 0 and votes[1] >= 30 * (PHOTOS - count) for votes in found.values())
 
 
-def test_a_single_other_photo_does_not_contradict_a_pose(made):
-    """Which of two is wrong nobody can tell."""
+def test_disagreement_with_a_single_photo_does_not_contradict_a_pose(made):
+    """With only two photos, it is unknown which pose is wrong."""
     model, path = made
     one, *others = numbers(model)
     for number in others[1:]:
@@ -63,7 +63,7 @@ def test_a_single_other_photo_does_not_contradict_a_pose(made):
     assert contradicted(model, path) == {}
 
 
-def test_few_matches_do_not_contradict_a_pose(made):
+def test_a_pair_with_few_matches_does_not_contradict_a_pose(made):
     model, path = made
     wrong = numbers(model)[0]
     misplace(model, wrong)

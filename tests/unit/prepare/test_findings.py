@@ -36,7 +36,7 @@ PLAN = plan_of(*map(photo, AERIAL + STREET))
 MODELS = [frozenset(AERIAL), frozenset(STREET)]
 
 
-def test_the_advice_for_two_models_at_different_heights_is_a_ramp():
+def test_the_advice_for_two_models_at_different_heights_is_a_flight_between_the_heights():
     heights = dict.fromkeys(AERIAL, 40.0) | dict.fromkeys(STREET, 5.0)
     (bridge,) = bridges_of(PLAN, [], parts_of(PLAN, MODELS), heights)
     assert "fly from 5 to 40 m here" in bridge.advice

@@ -123,7 +123,7 @@ def test_a_partly_written_georegistered_model_is_not_kept(model, layout, full):
 
 
 def test_bundle_adjustment_does_not_read_a_truncated_model(model, full, tmp_path, monkeypatch):
-    """Pycolmap would read it without an end."""
+    """Pycolmap would read the truncated model without end."""
     place = written(model, tmp_path / "0")
     monkeypatch.setattr(pycolmap, "triangulate_points", lambda *_, **__: model)
     with pytest.raises(UserError, match=FULL):
@@ -226,7 +226,7 @@ def test_partly_written_masks_of_killed_processes_are_deleted(layout):
 
 
 def test_writing_photos_requires_enough_disk_space(model, layout, free, monkeypatch):
-    """The writer of JPEG files ends the process where it cannot write."""
+    """The JPEG writer ends the process if it cannot write."""
     plan = scene_of_png(model, layout)
     monkeypatch.setattr(undistortion, "_undistort", lambda *_: pytest.fail("it was begun"))
     free(len(plan.used) * plan.used[0].width * plan.used[0].height // 2)
@@ -235,7 +235,7 @@ def test_writing_photos_requires_enough_disk_space(model, layout, free, monkeypa
 
 
 def test_features_and_matches_require_enough_disk_space(model, layout, free, monkeypatch):
-    """SQLite ends the process where it cannot write."""
+    """SQLite ends the process if it cannot write."""
     for module in (features, matching):
         monkeypatch.setattr(module, "waited", lambda *_: pytest.fail("it was begun"))
     plan = plan_of(model, layout.scene)

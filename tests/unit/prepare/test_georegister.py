@@ -160,7 +160,7 @@ def part_of(model, keep, folder):
 
 
 def test_two_halves_are_merged_into_the_whole_model(tmp_path):
-    """Photos, poses and points: those that one half alone has are in it, each photo once."""
+    """The merged model contains photos, poses and points of both halves, and each photo once."""
     model = synthetic()
     numbers = sorted(model.reg_image_ids())
     parts = {"one": set(numbers[:7]), "other": set(numbers[5:])}

@@ -45,7 +45,7 @@ def test_a_photo_with_few_points_gets_no_pose():
 
 
 def test_a_photo_with_few_points_does_not_join_models():
-    """Photos 1 and 2, and 3 and 4, are joined only through one that has too few points itself."""
+    """Photos 1 and 2 are joined with photos 3 and 4 only by a photo that has too few points."""
     tracks = [(40, (1, 2)), (40, (3, 4)), (14, (2, 5)), (14, (5, 3))]
     assert parts_of(model_of(tracks, 5), smallest=2) == [[1, 2], [3, 4]]
 

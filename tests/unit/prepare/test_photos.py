@@ -114,7 +114,7 @@ def test_masks_are_found_under_all_supported_names_and_do_not_count_as_photos(tm
 
 @pytest.mark.parametrize("wanted", [False, True])
 def test_masks_are_paired_by_the_rule_of_the_readers(wanted, tmp_path):
-    """Letter case, suffix, and words such as `mask` at either end may differ."""
+    """Letter case, suffix, and words such as `mask` at the start or the end may differ."""
     for number, mask in enumerate(("Mask_1.png", "2_SEG.png", "3.tif"), 1):
         save(tmp_path / f"{number}.JPG")
         save(tmp_path / "masks" / mask)
@@ -134,7 +134,7 @@ def test_a_named_mask_folder_must_exist(tmp_path):
 
 
 def test_masks_in_photo_folders_do_not_count_as_photos_and_are_reported(tmp_path):
-    """Most files of `a/masks` are named after photos; `b/masks` holds photos of carnival masks."""
+    """Most files in `a/masks` have names of photos. `b/masks` contains photos of carnival masks."""
     shot = ("a/1.jpg", "a/2.jpg", "b/1.jpg", "b/masks/7.jpg", "b/masks/8.jpg", "c/3.jpg")
     drawn = ("c/masks/3.png", "a/masks/1.jpg.png", "a/masks/2.png", "a/masks/gone.png")
     for name in (*shot, *drawn):
@@ -190,7 +190,7 @@ def test_images_of_a_named_mask_folder_inside_the_photos_do_not_count_as_photos(
 
 
 def test_the_folder_of_the_photos_may_also_contain_the_masks(tmp_path):
-    """No photo is its own mask."""
+    """A photo is not used as its own mask."""
     for name in ("1.jpg", "1.png", "2.png", "2.png.png", "3.png"):
         save(tmp_path / name)
     used, _ = found(tmp_path, masks=str(tmp_path))
@@ -228,7 +228,7 @@ def mask_of(folder, photo, mask, turn=1):
 @pytest.mark.parametrize("turn", range(1, 9))
 @pytest.mark.parametrize("part", [1, 2])
 def test_masks_in_display_orientation_are_turned_to_the_stored_orientation(turn, part, tmp_path):
-    """By Pillow, which turns photos by their EXIF headers; those of the stored photo stay."""
+    """Pillow turns photos by their EXIF headers. Masks of the stored photo are not turned."""
     stored = np.zeros((80, 120), np.uint8)
     stored[:20, :40] = 255
     exif = Image.Exif()
@@ -263,7 +263,7 @@ def test_damaged_masks_are_reported_at_once(tmp_path):
 
 
 def test_transparent_pixels_do_not_count(tmp_path):
-    """Only where alpha is below a half somewhere; with a mask both tell."""
+    """Alpha counts only if it is below one half in some pixel. Alpha and a mask are combined."""
     pixels = np.random.default_rng(0).integers(0, 256, (80, 100, 4), dtype=np.uint8)
     pixels[..., 3] = 255
     Image.fromarray(pixels).save(tmp_path / "opaque.png")
@@ -330,7 +330,7 @@ def test_folders_with_undecodable_names_give_one_error(what, tmp_path):
 def test_a_photo_that_is_too_large_gives_one_error_with_its_name(
     name, options, most, tmp_path, monkeypatch
 ):
-    """JPEG files that can be decoded reduced may have twice as many pixels."""
+    """JPEG files that can be decoded at reduced size may have twice as many pixels."""
     for number in (1, 2):
         save(tmp_path / f"{number}.jpg", size=(64, 64))
     save(tmp_path / name, **options)
@@ -350,7 +350,7 @@ def test_a_photo_that_is_too_large_gives_one_error_with_its_name(
     assert name not in decoded
 
 
-def test_one_of_two_identical_files_is_used(tmp_path):
+def test_only_one_of_two_identical_photo_files_is_used(tmp_path):
     for name in ("b.jpg", "c.jpg"):
         save(tmp_path / name)
     shutil.copy(tmp_path / "b.jpg", tmp_path / "a.jpg")

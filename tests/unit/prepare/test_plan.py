@@ -37,7 +37,7 @@ BEGUN = (photo("a"), photo("b", mask="m"), photo("c"))
 
 
 def test_preparation_continues_with_the_same_photos_in_another_folder(layout):
-    """Masks, too: a relative folder of them is another one elsewhere."""
+    """The same applies to masks. A relative mask folder is another folder there."""
     agreed(layout, plan(*BEGUN, masks="sky"))
     moved = [each.model_copy(update={"mask": each.mask and "/new/b.png"}) for each in BEGUN]
     found = agreed(layout, plan(*moved, root="/new", masks="/new/sky"))

@@ -118,7 +118,7 @@ def test_every_good_photo_gets_a_pose(report, scene, truth):
 
 
 def test_the_scene_is_placed_by_gps(report, scene, truth):
-    """Within the noise that is left: cameras lie at their GPS, in metres east, north, up."""
+    """Cameras are at their GPS positions (metres east, north, up) within the remaining noise."""
     georef = json.loads((scene / "georef.json").read_text())
     origin = [georef["origin"][key] for key in ("latitude", "longitude", "altitude")]
     assert origin[0] == pytest.approx(PLACE[0], abs=1e-3)
@@ -214,7 +214,7 @@ def test_hidden_files_of_other_programs_are_kept_and_temporary_files_of_prepare_
 
 
 def test_repeating_the_last_stages_gives_the_same_scene(report, photos, scene):
-    """What a kill may have left undone is done again, with the same result."""
+    """Work that a killed process did not finish is repeated with the same result."""
     before = content(scene)
     (scene / "report.json").unlink()
     shutil.rmtree(scene / "sparse")
@@ -321,7 +321,7 @@ def test_a_finished_scene_without_intermediate_files_is_not_prepared_again(copie
 
 
 def test_transparent_photos_get_a_mask(report, tmp_path):
-    """Undistorted as they are; what is not transparent gets none."""
+    """Masks are undistorted with their photos. A photo without transparent pixels gets no mask."""
     model = pycolmap.Reconstruction(bundled_scene() / "sparse" / "0")
     names = sorted(image.name for image in model.images.values())
     one = next(iter(model.cameras.values()))
@@ -415,7 +415,7 @@ def test_too_few_photos_are_refused_with_a_remedy(names, todo, tmp_path, capsys)
 
 
 def test_photos_in_linked_folders_are_found_once(tmp_path):
-    """One regime lies elsewhere; other links lead to what is there already, back, and further."""
+    """One regime is in a linked folder. Other links form a cycle or lead to known folders."""
     photos, elsewhere = tmp_path / "photos", tmp_path / "elsewhere"
     source = sorted((bundled_scene() / "images").rglob("*.jpg"))[:4]
     for place, photo in zip((photos / "street", elsewhere, tmp_path / "far"), source, strict=False):
@@ -448,7 +448,7 @@ def test_prepare_without_photos_is_refused(given, capsys, tmp_path, monkeypatch)
 
 
 def test_photos_without_matches_give_one_error(tmp_path, capfd):
-    """And not a line of pycolmap's beside it."""
+    """Pycolmap prints no other line."""
     rng = np.random.default_rng(0)
     (tmp_path / "my photos").mkdir()
     for number in range(3):

@@ -126,7 +126,7 @@ def test_a_photo_without_a_pose_gets_a_pose_from_its_pairs(made, tmp_path):
 
 
 def test_two_directions_locate_a_photo_without_points(made):
-    """The model has poses alone: how far to go is told by where directions cross."""
+    """The model contains only poses. The intersection of two directions gives the distance."""
     model, truth = made[0], truth_of(made[0])
     lost = numbers(model)[0]
     model.deregister_frame(model.image(lost).frame_id)
@@ -137,7 +137,7 @@ def test_two_directions_locate_a_photo_without_points(made):
 
 
 def test_wrong_pairs_are_outvoted_and_removed(made):
-    """Three of the seven pairs of a photo tell of nothing: their matches are mixed up."""
+    """The matches of three of the seven pairs of a photo are shuffled."""
     model, path = made
     truth, lost = truth_of(model), numbers(model)[0]
     wrong = set(numbers(model)[1:4])
@@ -159,7 +159,7 @@ def test_wrong_pairs_are_outvoted_and_removed(made):
 
 @pytest.mark.slow
 def test_mapping_continues_if_a_photo_has_no_pair_left(made, tmp_path):
-    """One photo is misplaced; all pairs of another one tell of nothing, so that they go aside."""
+    """One photo is misplaced. All pairs of another photo have shuffled matches and are removed."""
     model, path = made
     truth, (lost, strange, *_) = truth_of(model), numbers(model)
     rng = np.random.default_rng(0)
@@ -185,7 +185,7 @@ def test_mapping_continues_if_a_photo_has_no_pair_left(made, tmp_path):
 
 
 def test_level_photos_of_flat_ground_give_relative_rotations(made):
-    """All matches of a pair shift alike, as a watermark would."""
+    """All matches of a pair are shifted equally, as by a watermark."""
     rays = np.random.default_rng(0).uniform(-0.3, 0.3, (200, 2)).astype(np.float32)
     shifted = rays + np.float32([0.1, 0.0])
     still = pycolmap.Rigid3d()
@@ -226,7 +226,7 @@ def test_a_photo_moves_from_a_smaller_model_to_the_largest(made, tmp_path):
 
 @pytest.mark.slow
 def test_a_refinement_round_with_fewer_supporting_matches_is_discarded(made):
-    """Mapping goes on and throws all photos but two about, as often as it is asked."""
+    """Each mapping round moves all photos except two to wrong poses."""
     model, path = made
     truth, lost = truth_of(model), numbers(model)[0]
     misplace(model, lost)
@@ -251,7 +251,7 @@ def test_a_refinement_round_with_fewer_supporting_matches_is_discarded(made):
 def test_a_camera_missing_in_the_largest_model_is_calibrated_from_other_models(
     tmp_path, is_there, in_other
 ):
-    """Each photo has its own camera; the database only guesses their focal lengths."""
+    """Each photo has a separate camera. The database contains only estimated focal lengths."""
     model, path = made_of(tmp_path, rigs=PHOTOS)
     known = {number: camera.params.copy() for number, camera in model.cameras.items()}
     database = pycolmap.Database.open(path)

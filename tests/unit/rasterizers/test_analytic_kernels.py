@@ -33,7 +33,7 @@ def test_the_approximate_normal_density_decreases_at_least_as_fast_as_its_bound(
 
 
 @pytest.mark.parametrize("sigma", [1e-3, 0.05, 0.3, 1.0, 7.0, 1e4])
-def test_the_window_is_the_difference_of_the_distribution_over_a_pixel(sigma):
+def test_the_window_is_the_difference_of_the_distribution_function_across_a_pixel(sigma):
     def distribution(x):
         return 1 / (1 + np.exp(-np.clip(LINEAR * x + CUBIC * x**3, -700, 700)))
 
@@ -45,7 +45,7 @@ def test_the_window_is_the_difference_of_the_distribution_over_a_pixel(sigma):
 
 
 @pytest.mark.parametrize("opacity", [0.004, 0.02, 0.3, 1.0])
-def test_touched_pixels_are_within_the_radius(opacity):
+def test_pixels_touched_by_a_gaussian_are_within_its_radius(opacity):
     rng = np.random.default_rng(0)
     sigmas = np.exp(rng.uniform(np.log(1e-3), np.log(50), (40_000, 2)))
     offsets = rng.uniform(0, 1, (40_000, 2)) * (4 * sigmas + 1)

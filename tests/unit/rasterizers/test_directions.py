@@ -39,7 +39,7 @@ def drawn(gaussians, camera, weights, background=(0.0, 0.0, 0.0), name="torch", 
 
 @pytest.mark.parametrize("response", ["plain", "antialiased", "analytic"])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_the_bins_of_the_reference_agree_with_single_pixels(response, seed):
+def test_direction_bins_of_the_reference_agree_with_gradients_of_single_pixels(response, seed):
     gaussians = smooth_gaussians(25, CAMERA, seed=seed, response=response)
     weights, background = weighting(CAMERA), (0.3, 0.1, 0.6)
     found = drawn(gaussians, CAMERA, weights, background).directions.numpy()
@@ -53,7 +53,7 @@ def test_the_bins_of_the_reference_agree_with_single_pixels(response, seed):
 
 @pytest.mark.parametrize("name", ["torch", "numba"])
 @pytest.mark.parametrize("response", ["plain", "antialiased", "analytic"])
-def test_the_bins_add_up_to_the_statistics_without_bins(name, response):
+def test_direction_bins_add_up_to_the_statistics_without_bins(name, response):
     gaussians = random_gaussians(80, CAMERA, response=response)
     screen = drawn(gaussians, CAMERA, weighting(CAMERA), name=name)
     total = screen.directions.double().sum(1)
@@ -116,7 +116,7 @@ def test_directions_refer_to_ndc_units(name):
 
 
 @pytest.mark.parametrize("name", ["torch", "numba"])
-def test_an_axis_along_the_view_has_one_bin(name):
+def test_an_axis_that_points_at_the_camera_has_one_direction_bin(name):
     # The longest axis points at the camera.
     gaussians, camera = one_gaussian(scales=(0.05, 0.05, 0.2))
     bins = drawn(gaussians, camera, brighter(camera), name=name).directions[0]

@@ -49,7 +49,7 @@ def drawn(rasterizer, gaussians, camera, background=(0.1, 0.5, 0.3)):
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 def test_gsplat_projection_agrees_with_the_reference(camera):
-    """Means, depths, covariances and the margin of the Jacobian, in float64."""
+    """Compare means, depths, covariances and the Jacobian clamp in float64."""
     gaussians = random_gaussians(200, camera, seed=1, border=1.5)
     ours = project(gaussians.means, gaussians.quats, gaussians.scales, camera)
     covariances, _ = reference._quat_scale_to_covar_preci(
@@ -88,7 +88,7 @@ def test_gsplat_thresholds_equal_the_reference_except_the_alpha_cap():
 
 
 def test_the_footprint_of_gsplat_is_never_smaller_than_the_reference():
-    """3.33 standard deviations, where gsplat ends, lie beyond alpha = 1/255 at any opacity."""
+    """gsplat ends at 3.33 standard deviations, which is beyond alpha = 1/255 at any opacity."""
     assert (2 * torch.tensor(255.0).log()).sqrt() < gsplat_on_cpu.EXTENT
 
 
@@ -123,7 +123,7 @@ def test_gsplat_radii_equal_the_reference_for_visible_gaussians(gsplat):
 
 
 def test_gsplat_differs_from_the_default_only_by_its_alpha_cap_of_0_999(gsplat):
-    """Opacities above 0.99 only, and by 0.009 at most."""
+    """Only opacities above 0.99 differ, by at most 0.009."""
     camera = CAMERAS["middle"]
     at_centre = replace(
         random_gaussians(1, camera, border=-0.5, sigmas=(12.0, 13.0)),
@@ -139,7 +139,7 @@ def test_gsplat_differs_from_the_default_only_by_its_alpha_cap_of_0_999(gsplat):
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 @pytest.mark.parametrize("band", [1 << 19, 3 * 37])
 def test_gsplat_pixel_counts_agree_with_the_reference(gsplat, monkeypatch, camera, band):
-    """Of all pixels and of some, of each of two views, however many are looked at at once."""
+    """Count all pixels or a part of them, in two views, with any number of views per call."""
     monkeypatch.setattr(blended, "PIXELS", band)
     scenes = [leaves(random_gaussians(25, camera, seed=s, opacities=(0.5, 1.0))) for s in (10, 11)]
     marks = torch.rand(camera.height, camera.width, generator=torch.manual_seed(3)) < 0.3
@@ -166,7 +166,7 @@ def test_gsplat_antialiasing_differs_noticeably_only_for_gaussians_below_a_pixel
 
 
 def test_views_rendered_together_equal_views_rendered_one_by_one(gsplat):
-    """Two sizes, two numbers of Gaussians: statistics and gradients stay each view's own."""
+    """The two views have different sizes and numbers of Gaussians. Results stay separate."""
     small = posed_camera(20, 12)
     moved = replace(CAMERAS["middle"], cx=15.0)
     cameras = [CAMERAS["middle"], small, moved, CAMERAS["middle"]]

@@ -133,7 +133,7 @@ def test_gswarp_inputs_and_outputs_agree_with_the_reference(gswarp, camera, sh_d
 
 
 def test_the_option_near_sets_the_near_plane_of_gswarp(gswarp):
-    """gswarp's own lies at 0.2 of the units that it is given."""
+    """The default near plane of gswarp is at 0.2 units."""
     camera = replace(CAMERA, world_to_camera=torch.eye(4, dtype=torch.float64))
     scene = random_gaussians(2, camera, border=-0.4, sigmas=(2.0, 3.0))
     depths = torch.tensor([0.049, 0.051], dtype=torch.float64)
@@ -144,7 +144,6 @@ def test_the_option_near_sets_the_near_plane_of_gswarp(gswarp):
 
 
 def test_the_gradient_of_projected_means_is_per_pixel(gswarp):
-    """With the shape held gswarp's differs from ours, which the stand-in moves in space."""
     scene = random_gaussians(20, CAMERA, seed=8, border=-0.1, sigmas=(0.8, 1.2))
     reference = TorchRasterizer(near=0.05, footprint="3-sigma")
     mine, theirs = leaves(scene), leaves(scene)

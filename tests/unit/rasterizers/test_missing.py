@@ -151,7 +151,7 @@ def test_outputs_that_a_rasterizer_lacks_are_refused_before_training(
     assert any(reason in objection for objection in objections_to(selection))
 
 
-def test_gswarp_refuses_a_backbone_that_sets_its_dilation(machine):
+def test_gswarp_refuses_a_backbone_that_sets_a_dilation(machine):
     machine("gswarp", "warp")
 
     class Own(type(build("backbones", "vanilla", {}))):

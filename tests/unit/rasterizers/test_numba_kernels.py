@@ -267,7 +267,7 @@ def test_absolute_gradients_are_sums_of_absolute_gradients_over_pixels():
     np.testing.assert_allclose(gradients.centres, signed, rtol=1e-4, atol=1e-4)
 
 
-def test_optional_outputs_change_no_other_gradient():
+def test_requesting_optional_outputs_changes_no_gradient():
     size = (40, 30)
     gaussians, v = cloud(80, size), weights(size)
     plain = backward(drawn(gaussians, camera(*size)), v[0])
@@ -281,7 +281,7 @@ def test_optional_outputs_change_no_other_gradient():
 @pytest.mark.parametrize("response", ["plain", "antialiased", "analytic"])
 @pytest.mark.parametrize("count", [1, 40, 5000])
 def test_reused_memory_changes_no_gradient(monkeypatch, count, response):
-    """Of Gaussians that are drawn and of those beside the image."""
+    """Test rendered Gaussians and Gaussians outside the image."""
     size, view = (40, 24), camera(40, 24)
     gaussians = cloud(count, size)
     gaussians.means[::2, 0] += 1000.0
@@ -455,7 +455,7 @@ def test_rows_of_sixteen_numbers_fill_cache_lines(count):
     assert count == 0 or room.ctypes.data % 64 == 0
 
 
-def test_two_frames_can_exist_at_the_same_time():
+def test_two_rendered_frames_can_exist_at_the_same_time():
     size = (40, 30)
     first, second = cloud(50, size, seed=1), cloud(70, size, seed=2)
     v_image = weights(size)[0]
@@ -528,7 +528,7 @@ def test_items_of_equal_depth_keep_their_order(count):
 
 @pytest.mark.parametrize("count", [0, 1, 2, 1023, 1025, 5000])
 @pytest.mark.parametrize("magnitudes", [1e-6, 0.1, 3, 20, 700])
-def test_order_by_depth_is_stable_and_sorted(count, magnitudes):
+def test_the_sort_by_depth_is_stable(count, magnitudes):
     rng = np.random.default_rng(count)
     depths = np.exp(rng.uniform(-magnitudes, magnitudes, count))
     depths[rng.uniform(size=count) < 0.5] = 1.0

@@ -94,7 +94,7 @@ def test_every_pixel_follows_the_published_rule(name, seed):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_published_footprint_is_smaller_than_the_default_footprint(name):
-    """A round Gaussian whose 3.3 standard deviations reach one tile farther than its 3."""
+    """A round Gaussian reaches one more tile with 3.3 standard deviations than with 3."""
     scale = torch.full((1, 3), 0.0643)  # 3.9 pixels, dilated
     facing = sample_camera().world_to_camera[2, :3].float()
     mean = (sample_camera().center.float() + facing)[None]

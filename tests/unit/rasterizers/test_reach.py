@@ -12,7 +12,7 @@ def _reached(first, last):
     return reached_patches(load_wide(first, 0), load_wide(last, 0))
 
 
-def test_reached_patches_are_the_patches_with_a_touched_pixel():
+def test_reached_patches_are_exactly_the_patches_with_a_touched_pixel():
     rng = np.random.default_rng(0)
     for _ in range(300):
         first = np.round(rng.normal(30, 30, WIDE)).astype(np.float32)

@@ -139,7 +139,7 @@ def test_absolute_gradients_are_computed_only_if_requested():
 
 
 @pytest.mark.parametrize("response", RESPONSES)
-def test_rendering_tiles_twice_changes_no_bit(response, monkeypatch):
+def test_rendering_tiles_again_for_the_backward_pass_changes_no_bit(response, monkeypatch):
     camera = posed_camera(37, 21)
     gaussians = random_gaussians(40, camera, response=response)
 

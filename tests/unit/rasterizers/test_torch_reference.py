@@ -152,7 +152,7 @@ def test_clamped_channels_and_inactive_bands_have_zero_gradient():
     assert (gaussians.sh_rest.grad[:, :3] != 0).any()
 
 
-def test_the_antialiased_response_divides_the_opacity_by_the_gain_in_area():
+def test_the_antialiased_response_divides_opacity_by_the_increase_in_footprint_area():
     variance, dilation = (20.0 * 0.02 / 2.0) ** 2, 0.1
     gaussians = stack([2.0], [0.8], sigma=0.02, response="antialiased", dilation=dilation)
     det0, det1 = variance**2, (variance + dilation) ** 2

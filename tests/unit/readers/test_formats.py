@@ -91,7 +91,7 @@ def test_formats_with_matrices_keep_every_bit_of_the_cameras(reader, scenes):
 
 
 @pytest.mark.parametrize("model", ["OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"])
-def test_lenses_of_each_format_are_undistorted_like_those_of_colmap(model, tmp_path):
+def test_lenses_of_each_format_are_undistorted_like_colmap_lenses(model, tmp_path):
     scene = write_tiny_scene(
         tmp_path / "scene", views=2, width=40, height=30, points=40, model=model, mixed=True
     )

@@ -40,7 +40,7 @@ def read(path, **options):
     return MetashapeReader.model_validate(options).read(path, SceneOptions())
 
 
-def test_lens_parameters_follow_the_agisoft_convention():
+def test_lens_parameters_are_read_in_the_agisoft_convention():
     # x' = x + P1 (r^2 + 2 x^2) + 2 P2 x y; u = w / 2 + cx + x' (f + B1).
     terms = {"f": 100.0, "cx": 2.0, "cy": -3.0, "b1": 5.0, "p1": 0.01, "p2": 0.02, "k1": 0.1}
     fields = metashape.Fields({"width": 40.0, "height": 30.0, **terms}, "cameras.xml")
@@ -57,7 +57,7 @@ def test_lens_parameters_follow_the_agisoft_convention():
     np.testing.assert_allclose(camera.img_from_cam(np.array([[x, y, 1.0]]))[0], pixel, rtol=1e-12)
 
 
-def test_the_coordinates_of_the_chunk_can_be_selected(path):
+def test_the_coordinate_frame_of_the_metashape_chunk_can_be_selected(path):
     (path / "points.ply").unlink()
     reader, options = MetashapeReader(frame="chunk"), SceneOptions(init="random")
     own, world = reader.read(path, options), MetashapeReader().read(path, options)
@@ -74,7 +74,7 @@ def test_points_of_the_other_frame_are_refused_with_the_option(path):
 
 
 def test_a_georeferenced_chunk_is_converted_to_the_local_frame(path):
-    """Moved to Berlin by an independent way, the scene comes back as it was: east, north, up."""
+    """Move the scene to Berlin by an independent computation. The reader must undo the move."""
     guard_pycolmap()
     import pycolmap
 
@@ -134,7 +134,7 @@ def test_a_disabled_camera_is_left_out(path):
     ],
 )
 def test_a_compensated_rolling_shutter_is_refused_with_a_remedy(told, path):
-    """Its poses are those of one row of each photo, the others have other ones."""
+    """The poses belong to one row of each photo. Other rows have other poses."""
     edit(path, r"(<sensor [^>]*>)", rf"\1{told}")
     with pytest.raises(metashape.UserError, match="rolling shutter") as caught:
         read(path)

@@ -109,7 +109,7 @@ def test_slave_cameras_are_placed_by_their_master_and_the_offset(order, path):
     assert any("2 slave cameras with poses from their masters" in note for note in scene.notes)
 
 
-def test_offsets_may_refer_to_another_sensor_than_that_of_the_master(path):
+def test_offsets_may_refer_to_a_sensor_other_than_the_master_sensor(path):
     base = np.eye(4)
     base[:3, :3] = Rotation.from_rotvec([0.2, -0.3, 0.1]).as_matrix()
     base[:3, 3] = [0.5, -0.1, 0.2]

@@ -71,7 +71,9 @@ def test_lens_values_of_a_frame_override_the_values_of_the_file(tmp_path):
         ({"fl_y": 41.0}, {"fl_x": 30.0, "fl_y": 31.0}, (30.0, 41.0)),
     ],
 )
-def test_a_focal_length_of_a_frame_is_not_mixed_with_that_of_the_file(own, shared, focal, tmp_path):
+def test_a_focal_length_of_a_frame_is_not_mixed_with_the_focal_length_of_the_file(
+    own, shared, focal, tmp_path
+):
     camera = read(write(tmp_path, own, **{"w": 24, "h": 16, **shared})).views[0].camera
     assert (camera.fx, camera.fy) == pytest.approx(focal)
 
@@ -98,7 +100,7 @@ def test_an_incomplete_focal_length_of_a_frame_is_an_error(tmp_path):
         ({"is_fisheye": True}, {"is_fisheye": True, "k1": 0.1}, "OPENCV_FISHEYE", (0.1, 0, 0, 0)),
     ],
 )
-def test_distortion_of_a_frame_is_not_mixed_with_that_of_the_file(
+def test_distortion_of_a_frame_is_not_mixed_with_distortion_of_the_file(
     own, shared, model, terms, tmp_path
 ):
     frame, whole = (Fields(each, tmp_path / "transforms.json") for each in (own, LENS | shared))
@@ -160,7 +162,7 @@ def test_masks_named_by_frames_are_used(tmp_path):
         ({"train": (1,), "val": (0,), "test": (2,)}, ["c.png"]),
     ],
 )
-def test_lists_in_the_file_define_the_split(lists, held_out, tmp_path):
+def test_split_lists_in_the_transforms_file_define_the_split(lists, held_out, tmp_path):
     names = {
         f"{part}_filenames": [f"./images/{NAMES[i]}" for i in rows] for part, rows in lists.items()
     }
@@ -234,7 +236,7 @@ def test_an_ignored_crop_is_reported(tmp_path):
 
 
 @pytest.mark.parametrize(("named", "stored"), [("a", "a.png"), ("a.b", "a.b.png"), ("a", "a")])
-def test_names_without_a_suffix_refer_to_png_files(named, stored, tmp_path):
+def test_photo_names_without_a_suffix_refer_to_png_files(named, stored, tmp_path):
     path = write(tmp_path, **LENS)
     (path / "images" / "a.png").rename(path / "images" / stored)
     whole = json.loads((path / "transforms.json").read_text())

@@ -98,7 +98,7 @@ def test_georeferencing_does_not_change_training(with_gps, plain):
     np.testing.assert_array_equal(ours.similarity.offset, theirs.similarity.offset)
 
 
-def test_residuals_are_the_errors_of_gps(scene):
+def test_residuals_of_the_georeference_are_the_errors_of_gps(scene):
     residuals = read(located(scene, noise=1.5)).georeference.residuals
     # Seven of thirty numbers go into the similarity.
     assert residuals["rms_horizontal"] == pytest.approx(1.5 * np.sqrt(2), rel=0.5)
@@ -290,7 +290,7 @@ def test_priors_in_the_database_georeference_the_scene_and_the_database_is_uncha
     assert sorted(p.name for p in scene.iterdir()) == ["database.db", "images", "sparse"]
 
 
-def test_priors_without_gps_coordinates_are_ignored(scene):
+def test_pose_priors_without_gps_coordinates_are_ignored(scene):
     write_priors(scene, scene / "database.db", wgs84=False)
     assert read(scene).georeference is UNPLACED
 
@@ -310,8 +310,8 @@ def edit(path, *lines):
         database.commit()
 
 
-def test_priors_that_name_each_other_many_times_are_read_once(tmp_path):
-    """Joined they would be 4 * 10^8."""
+def test_pose_priors_that_refer_to_each_other_many_times_are_read_once(tmp_path):
+    """A join would return 4 * 10^8 rows."""
     path = tmp_path / "database.db"
     blob = struct.pack("<3d", 52.0, 13.0, 30.0).hex()
     count = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < 20000)"

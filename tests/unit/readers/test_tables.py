@@ -61,7 +61,7 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("form", CHANGES)
-def test_the_table_is_read_in_all_saved_forms(form, scene):
+def test_a_realitycapture_table_is_read_in_all_forms_in_which_it_may_be_saved(form, scene):
     (file,) = scene.glob("*.csv")
     before, _ = read(scene)
     changed = CHANGES[form](file.read_text())
@@ -110,7 +110,7 @@ def test_a_quote_in_a_comment_gives_an_error(scene):
         read(scene)
 
 
-def test_a_similar_table_does_not_prevent_another_reader(tmp_path):
+def test_a_similar_table_does_not_prevent_the_use_of_another_reader(tmp_path):
     path = write_tiny_scene(tmp_path, views=2, width=24, height=16, points=20)
     (path / "gps.csv").write_text("name,x,y,alt,heading\n")
     assert read(path)[1] == "colmap"

@@ -122,7 +122,7 @@ def spectra(draw):
     st.sampled_from([1.5, 4.0, 50.0]),
     st.integers(1, 40),
 )
-def test_scales_agree_with_the_definition(kept, shorter, coarsest, ratio, levels):
+def test_render_scales_agree_with_the_definition(kept, shorter, coarsest, ratio, levels):
     resolution = Spectral(coarsest=coarsest, ratio=ratio, levels=levels)
     scales = resolution._scales(group_of(kept, shorter))
     least = min(1.0, max(1 / coarsest, 96 / shorter))
@@ -133,7 +133,7 @@ def test_scales_agree_with_the_definition(kept, shorter, coarsest, ratio, levels
     assert (np.diff(scales) >= 0).all()
 
 
-def test_scales_of_a_flat_spectrum_follow_the_published_rule():
+def test_render_scales_of_a_flat_spectrum_follow_the_published_rule():
     # All scales alike in frequency: X(F_r) / X(F) = 1 / r^2, so that 1/r = 1/2 has a quarter.
     kept = (np.arange(GRID + 1) / GRID) ** 2
     scales = Spectral(levels=4)._scales(group_of(kept, 10_000))
@@ -149,7 +149,7 @@ def test_scales_of_a_flat_spectrum_follow_the_published_rule():
         (APART, "never", ["all"]),
     ],
 )
-def test_regimes_get_separate_scales_if_their_spectra_differ(scene, per_regime, names):
+def test_regimes_get_separate_render_scales_if_their_spectra_differ(scene, per_regime, names):
     resolution = Spectral(per_regime=per_regime).fitted_to(scene)
     assert sorted(resolution.courses) == names
     photos = {name: each.photos for name, each in resolution.courses.items()}
@@ -177,7 +177,7 @@ def test_a_fitted_resolution_is_read_back_without_a_new_measurement():
         assert known == asked(Spectral(), schedule, step)[0]
 
 
-def test_an_unknown_regime_also_gets_scales():
+def test_an_unknown_regime_also_gets_render_scales():
     resolution = Spectral(courses={"street": Scales(photos=3, scales=(0.5,))})
     assert asked(resolution, Schedule.for_run(1000), 1)[0] == (0.5, 0.5)
 
@@ -265,7 +265,7 @@ def test_a_budget_counts_the_rendered_pixels(resolution, unit, plan):
 @pytest.mark.parametrize("resolution", [Spectral().fitted_to(APART), Octaves()])
 @settings(max_examples=25, deadline=None)
 @given(lengths=st.lists(st.integers(50, 4000), min_size=1, max_size=5), seed=st.integers(0, 99))
-def test_no_scale_decreases_when_the_length_of_a_run_changes(resolution, lengths, seed):
+def test_no_render_scale_decreases_when_the_length_of_a_run_changes(resolution, lengths, seed):
     rng = np.random.default_rng(seed)
     schedule, state, last = Schedule.for_run(lengths[0]), PluginState(), (0.0, 0.0)
     step = 0
@@ -305,12 +305,12 @@ def test_a_size_of_octaves_may_be_omitted(options, text):
     assert told == f"resolution: {text}; no side has fewer than 96 pixels"
 
 
-def test_sizes_out_of_order_are_refused():
+def test_render_sizes_of_octaves_that_are_out_of_order_are_refused():
     with pytest.raises(UserError, match="half_until must be at least"):
         build("resolutions", "octaves", {"quarter_until": 0.5, "half_until": 0.3})
 
 
-def test_the_note_names_the_steps_at_which_the_scales_change():
+def test_the_note_names_the_steps_at_which_the_render_scales_change():
     resolution, schedule = Spectral().fitted_to(APART), Schedule.for_run(2000)
     (text,) = resolution.messages(schedule)
     told = dict(zip(("far", "near"), text.removeprefix("resolution: ").split("; "), strict=True))

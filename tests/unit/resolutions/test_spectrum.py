@@ -66,7 +66,9 @@ def test_sums_of_amplitudes_agree_with_the_definition(height, width, seed):
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(1, 20), st.integers(1, 20), st.integers(1, 3), st.integers(0, 999))
-def test_shares_grow_from_the_share_of_the_mean_colour_to_one(height, width, photos, seed):
+def test_kept_shares_of_the_spectrum_grow_from_the_share_of_the_mean_colour_to_one(
+    height, width, photos, seed
+):
     rng = np.random.default_rng(seed)
     pixels = rng.integers(0, 256, (photos, height, width, 3), dtype=np.uint8)
     shares = kept_shares(views_of(*(Given(torch.from_numpy(each)) for each in pixels)))

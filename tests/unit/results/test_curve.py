@@ -76,7 +76,7 @@ def test_rendered_views_are_marked_at_the_time_they_were_reached(tmp_path: Path,
     assert ticks["800"] == pytest.approx(6.0)
 
 
-def test_one_regime_is_not_drawn_twice(tmp_path: Path, figures):
+def test_the_curve_of_a_single_regime_is_not_drawn_twice(tmp_path: Path, figures):
     draw_curve(tmp_path, make_rows(3, ("far",)), "title", {"far": 1})
     assert len(figures[0].axes[0].get_lines()) == 1
 
@@ -94,7 +94,9 @@ def test_a_curve_without_data_is_not_an_error(tmp_path: Path, rows: list[Row]):
     assert draw_curve(tmp_path, rows, "title").is_file()
 
 
-def test_names_are_shown_without_interpretation(tmp_path: Path, figures):
+def test_scene_and_regime_names_are_drawn_without_interpretation_as_formulas(
+    tmp_path: Path, figures
+):
     draw_curve(tmp_path, make_rows(2, ("_raw", "a$b$")), "scene $x_1$", {"_raw": 1, "a$b$": 1})
     labels = [text.get_text().split(":")[0] for text in figures[0].legends[0].get_texts()]
     assert labels == ["overall", "'_raw' (1 view)", r"a\$b\$ (1 view)"]

@@ -45,7 +45,7 @@ def test_a_second_process_is_refused_with_the_holder_and_its_start_time(tmp_path
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_the_lock_ends_with_its_process(tmp_path, holder, number):
+def test_the_lock_of_a_run_folder_ends_with_its_process(tmp_path, holder, number):
     os.kill(holder.pid, number)
     holder.wait()
     assert (tmp_path / FILE).is_file()
@@ -54,7 +54,7 @@ def test_the_lock_ends_with_its_process(tmp_path, holder, number):
         assert held
 
 
-def test_the_lock_works_within_one_process_and_ends_with_the_block(tmp_path):
+def test_a_second_lock_in_the_same_process_is_refused_until_the_block_ends(tmp_path):
     with locked(tmp_path, "training"):
         with pytest.raises(RunInUseError, match=f"process {os.getpid()}"), locked(tmp_path, "x"):
             pass

@@ -16,7 +16,7 @@ def record(step: int, losses: tuple[float, ...] = (0.1, 0.3), seconds: float = 0
     return StepRecord(step, (0,) * len(losses), names, None, losses, 1234, {}, step * seconds)
 
 
-def test_the_progress_line_shows_loss_rate_and_time_left():
+def test_the_progress_line_shows_loss_steps_per_second_and_remaining_time():
     pace = Pace(total=1000)
     assert progress_line(pace) == ""
     for step in (1, 2, 3):
@@ -26,7 +26,7 @@ def test_the_progress_line_shows_loss_rate_and_time_left():
     )
 
 
-def test_the_loss_is_smoothed():
+def test_the_progress_line_shows_a_smoothed_loss():
     pace = Pace(total=10).after(record(1, (1.0,)))
     assert pace.loss == 1.0
     assert pace.after(record(2, (0.0,))).loss == pytest.approx(0.95)

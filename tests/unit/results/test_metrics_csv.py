@@ -21,7 +21,7 @@ HEADER = (
 )
 
 
-def test_the_table_has_columns_for_every_regime():
+def test_the_metrics_table_has_columns_for_every_regime():
     assert ",".join(columns(["near", "far"])) == HEADER
 
 
@@ -88,7 +88,7 @@ def test_resuming_without_a_table_creates_a_table(tmp_path: Path):
 
 
 @pytest.mark.parametrize("text", ["", "step,psnr\n1,2\n"])
-def test_the_table_of_another_run_is_refused(tmp_path: Path, text: str):
+def test_the_metrics_table_of_another_run_is_refused(tmp_path: Path, text: str):
     (tmp_path / "metrics.csv").write_text(text)
     with pytest.raises(UserError, match="another run"):
         MetricsCsv.resume(tmp_path, columns(["near", "far"]), step=5)

@@ -63,7 +63,7 @@ def test_dropout_removes_a_share_of_gaussians_and_increases_the_other_opacities(
 
 
 def test_nearly_opaque_gaussians_still_get_a_gradient_under_dropout():
-    """Its opacity is cut off at 1, its gradient is not."""
+    """The opacity is clipped at 1, but its gradient is not."""
     setup = setup_of(rules={"dropout": {"share": 0.3}})
     state = first_state(setup)
     logits = torch.full((500,), 3.0, requires_grad=True)

@@ -130,7 +130,7 @@ def test_removing_floaters_does_not_change_the_renders_of_photos(backbone):
     assert state.primitives(setup) == primitives - len(gone)
 
 
-def test_moments_states_and_the_average_are_reduced_together():
+def test_removing_floaters_reduces_moments_states_and_the_average_together():
     setup = setup_of(rules={"weight-averaging": {"share": 1.0}})
     state = scattered(setup)
     for _ in range(3):
@@ -162,7 +162,7 @@ def test_floaters_are_searched_in_the_averaged_parameters():
     assert torch.equal(floaters(setup, state), gone)
 
 
-def test_a_failed_removal_does_not_change_the_state():
+def test_a_failed_removal_of_floaters_does_not_change_the_state():
     setup = setup_of()
     state = scattered(setup)
     take_step(setup, state)
@@ -250,7 +250,7 @@ def test_the_floaters_rule_is_selected_by_default(given, what):
     assert bool(resolved(setup_of(**given)).rules.get("floaters")) == what
 
 
-def test_densifier_none_is_the_only_one_without_removal_of_floaters():
+def test_only_densifier_none_disables_the_removal_of_floaters():
     never = {n for n in entries("densifiers") if not build(Densifier, n, {}).edits}
     assert never == {"none"}
     said = (Path(__file__).parents[3] / "docs" / "rules.md").read_text(encoding="utf-8")
@@ -258,6 +258,6 @@ def test_densifier_none_is_the_only_one_without_removal_of_floaters():
     assert "none" in row
 
 
-def test_the_message_uses_singular_and_plural():
+def test_the_message_about_floaters_uses_singular_and_plural():
     assert removed(1).startswith("floaters: 1 primitive was removed")
     assert removed(1200).startswith("floaters: 1,200 primitives were removed")

@@ -90,7 +90,7 @@ def expected(setup, state, bound):
     ("seed", "bound", "at_once"),
     [(0, None, 1), (1, None, 2**20), (2, 0.2, 1), (3, 0.2, 2**20), (4, 3.0, 1), (5, 3.0, 2**20)],
 )
-def test_axes_are_clamped_to_the_allowed_length(seed, bound, at_once, monkeypatch):
+def test_axes_of_gaussians_are_clamped_to_the_allowed_length(seed, bound, at_once, monkeypatch):
     monkeypatch.setattr(scale_clamp, "_AT_ONCE", at_once)
     setup = setup_of(rules=using(bound))
     state = at_random(setup, seed)
@@ -120,7 +120,7 @@ def test_non_finite_and_small_scales_are_not_clamped():
 
 
 def test_scales_below_the_bound_are_not_clamped():
-    """No Gaussian is large, or all are large and far away."""
+    """Either no Gaussian is large, or all Gaussians are large and far away."""
     setup = setup_of()
     state = at_random(setup, 0)
     scales = state.parameters["scales"].detach()
@@ -151,7 +151,7 @@ def test_scales_are_clamped_at_fixed_intervals_only():
 
 @pytest.mark.parametrize("backbone", AXES)
 def test_a_step_clamps_only_scales_above_the_bound(backbone):
-    """Adam's moments stay, and all that is not too long has the bits of a step without a bound."""
+    """The moments of Adam do not change. Other values have the bits of a step without a bound."""
     found = {}
     for bound in (None, 0.0):
         setup = setup_of(backbone, rules=using(bound), initializer={"name": "points"})

@@ -115,7 +115,7 @@ def runs(request):
 
 
 @pytest.mark.sampled(2)
-def test_learning_rates_are_the_published_ones_until_they_decay(runs):
+def test_learning_rates_equal_the_published_rates_until_they_decay(runs):
     blocks = runs.setups["plain"].trained_blocks
     of = {name: block.lr for block in blocks for name in block.tensors}
     published, fading = runs.plain[2], runs.both[2]
@@ -130,7 +130,7 @@ def test_learning_rates_are_the_published_ones_until_they_decay(runs):
     assert constant and all(published[0][n] == published[-1][n] for n in constant)
 
 
-def test_the_average_covers_the_last_steps_and_does_not_change_training(runs):
+def test_the_average_of_parameters_covers_the_last_steps_and_does_not_change_training(runs):
     (plain, _, _), (state, seen, _) = runs.plain, runs.averaged
     assert same(plain.parameters, state.parameters)
     assert NAME not in plain.states
@@ -218,7 +218,7 @@ def test_at_most_a_hundred_states_including_the_last_are_averaged(total, share, 
     assert len(set(np.diff(taken))) == 1
 
 
-def test_no_length_and_share_averages_more_than_a_hundred_states():
+def test_no_combination_of_length_and_share_averages_more_than_a_hundred_states():
     for total in (99, 100, 1000, 1490, 2001):
         for share in np.linspace(0.01, 1.0, 12):
             window = sum(step > (1.0 - share) * total for step in range(1, total + 1))
@@ -260,7 +260,7 @@ def test_a_longer_length_discards_an_average_that_began_too_early():
     ids=["fewer", "other-order", "reset", "nothing", "a-count"],
 )
 def test_an_edit_of_density_control_restarts_the_average(edit, count, monkeypatch):
-    """Of ten steps the last six are averaged, and the edit comes in the eighth."""
+    """The last six of ten steps are averaged, and the edit happens in step 8."""
     setup = setup_of(**using(NAME, share=0.6))
 
     def densify(self, context, state):
@@ -280,7 +280,7 @@ def test_noise_after_every_step_does_not_restart_the_average():
     assert state.states[NAME].values["count"] == 5
 
 
-def test_the_published_recipe_has_no_rate_tail_and_no_averaging():
+def test_the_published_recipe_has_no_learning_rate_tail_and_no_averaging():
     published = {"recipe": {"name": "published"}}
     assert resolved(setup_of(**published)).rules == {}
     both = {"lr-tail": {"share": 0.2}, NAME: {"share": 0.1}}
@@ -288,7 +288,7 @@ def test_the_published_recipe_has_no_rate_tail_and_no_averaging():
     assert resolved(setup_of(**published, rules=both)).rules == wanted
 
 
-def test_the_configuration_of_a_run_without_constant_rates_repeats_the_run():
+def test_the_configuration_of_a_run_without_constant_learning_rates_repeats_the_run():
     names = ("lr_features_final", "lr_scales_final", "lr_cov_final")
     config = RunConfig(
         steps=10, backbone=ComponentChoice(name="scaffold", **dict.fromkeys(names, 1e-5))

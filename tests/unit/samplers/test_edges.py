@@ -70,7 +70,7 @@ def test_a_pair_starts_with_the_near_view_and_further_pairs_follow():
     assert run.draw().labels == ("near", "far", "near", "far")
 
 
-def test_other_labels_alternate_in_alphabetical_order():
+def test_labels_other_than_near_and_far_alternate_in_alphabetical_order():
     run = SamplerRun(NearFar(), scene(4), ("street", "aerial", "street", "aerial"))
     draw = run.draw()
     assert draw.labels == ("aerial", "street")

@@ -18,7 +18,7 @@ def two_points(n):
 @pytest.mark.parametrize(
     ("n", "expected"), [(10, 0.566), (100, 0.951), (200, 0.975), (500, 0.990), (1000, 0.995)]
 )
-def test_two_equal_points_stay_below_one_in_the_finite_sample_form(n, expected):
+def test_the_finite_sample_coefficient_of_two_equal_groups_is_below_one(n, expected):
     found = bimodality(two_points(n))
     assert found.sample == pytest.approx(expected, abs=5e-4)
     assert found.population == pytest.approx(1.0)
@@ -39,14 +39,14 @@ def test_every_distribution_on_two_points_has_a_population_coefficient_of_one(sh
         pytest.param(quantiles(expon), 5 / 9, id="exponential"),
     ],
 )
-def test_known_distributions_reach_their_limits(values, expected):
+def test_known_distributions_have_the_expected_coefficients(values, expected):
     found = bimodality(values)
     assert found.population == pytest.approx(expected, abs=2e-3)
     assert found.sample == pytest.approx(expected, abs=2e-3)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_both_coefficients_are_computed_from_standard_moments(seed):
+def test_both_bimodality_coefficients_are_computed_from_standard_moments(seed):
     values = np.random.default_rng(seed).gamma(2.0, size=23)
     n = len(values)
     g1, g2 = skew(values, bias=False), kurtosis(values, bias=False)
@@ -57,7 +57,7 @@ def test_both_coefficients_are_computed_from_standard_moments(seed):
 
 
 @pytest.mark.parametrize(("scale", "shift"), [(1e-150, 0.0), (1e150, 0.0), (-3.0, 1e6)])
-def test_units_do_not_change_the_coefficient(scale, shift):
+def test_the_unit_of_the_values_does_not_change_the_bimodality_coefficient(scale, shift):
     values = np.random.default_rng(0).normal(size=40)
     found, moved = bimodality(values), bimodality(scale * values + shift)
     assert moved.sample == pytest.approx(found.sample, rel=1e-6)
@@ -73,7 +73,7 @@ def test_units_do_not_change_the_coefficient(scale, shift):
         pytest.param([0.0] * 5, "equal", id="zero"),
     ],
 )
-def test_values_without_a_coefficient_give_the_reason(values, reason):
+def test_values_without_a_bimodality_coefficient_give_the_reason(values, reason):
     found = bimodality(np.array(values))
     assert np.isnan([found.sample, found.population]).all()
     assert reason in found.reason

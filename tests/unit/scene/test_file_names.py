@@ -58,7 +58,7 @@ def test_a_file_with_an_exact_name_is_matched_with_no_other_name():
 
 
 @pytest.mark.parametrize("name", ["cam0/p0.png", "/data/cam0/p0.png"])
-def test_a_photo_missing_in_its_folder_is_not_replaced_by_one_of_another_folder(name):
+def test_a_photo_missing_in_its_folder_is_not_replaced_by_a_photo_of_another_folder(name):
     found = pair(("cam0/p1.png", "cam1/p0.png"), name)
     assert not found.files and not found.ambiguous
 
@@ -76,6 +76,6 @@ def test_empty_and_meaningless_names_match_no_file(name):
     assert not pair(("p0.png",), name).files
 
 
-def test_names_may_differ_in_suffix_case_and_unicode_form():
+def test_file_names_may_differ_in_suffix_case_and_unicode_form():
     assert same_spelling("a/P0.PNG", "A/p0.jpg")
     assert not same_spelling("images/p0.png", "p0.png")

@@ -56,7 +56,7 @@ def test_a_copied_scene_with_new_time_stamps_is_recognised(pristine, scene):
 
 
 def test_a_missing_photo_that_shifts_the_split_is_reported(scene):
-    """Held out is each eighth photo by name: 0000 and 0008, then 0000 and 0009."""
+    """Every eighth photo by name is held out: first 0000 and 0008, then 0000 and 0009."""
     was = taken(scene)
     (scene / "images" / "0002.png").unlink()
     found = told(scene, was)

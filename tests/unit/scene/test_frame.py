@@ -8,7 +8,7 @@ CENTERS = RNG.normal(size=(20, 3)) * [30, 20, 5]
 POINTS = RNG.normal(size=(2000, 3)) * [60, 60, 8]
 
 
-def test_the_unit_is_the_extent_of_the_training_cameras():
+def test_the_unit_of_length_is_the_extent_of_the_training_cameras():
     centers = np.array([[1.0, 0, 0], [3.0, 0, 0], [2.0, 2, 0], [2.0, -2, 0]])
     frame = make_frame(centers, POINTS)
     np.testing.assert_allclose(frame.similarity.offset, [2, 0, 0])

@@ -90,7 +90,7 @@ def test_large_photos_are_trained_at_a_reduced_size(jpegs, small_limit, monkeypa
         assert np.abs(image - theirs.photo.image().numpy()).mean() < 4
 
 
-def test_a_folder_of_smaller_copies_also_solves_too_large_photos(tmp_path, small_limit):
+def test_too_large_photos_are_accepted_if_a_folder_of_smaller_copies_exists(tmp_path, small_limit):
     scene = write_tiny_scene(tmp_path, views=4, width=192, height=128, suffix=".png")
     with pytest.raises(UserError, match="_2, _4 or _8"):
         read(scene, max_size=96)
@@ -133,7 +133,7 @@ def test_a_photo_of_200_megapixels_is_decoded_in_little_memory(tmp_path):
 
 
 def test_a_decompression_bomb_is_refused_before_memory_is_allocated(tmp_path):
-    """400 megapixels of black in 49 kB."""
+    """The file has 49 kB and contains 400 megapixels of black."""
     width = height = 20_000
     header = b"IHDR" + width.to_bytes(4, "big") + height.to_bytes(4, "big") + b"\1\0\0\0\0"
     pixels = b"IDAT" + zlib.compress(bytes((width // 8 + 1) * height), 9)

@@ -76,7 +76,7 @@ def test_pixels_beyond_the_fold_do_not_count(
 
 
 @pytest.mark.parametrize(("model", "focal", "extra"), SOUND)
-def test_ordinary_lenses_lose_no_pixel_and_keep_the_frame_of_pycolmap(
+def test_ordinary_lenses_lose_no_pixel_and_have_the_same_frame_as_in_pycolmap(
     model: str, focal: tuple[float, ...], extra: tuple[float, ...]
 ) -> None:
     calibration = lens(model, focal, extra)
@@ -94,7 +94,7 @@ def test_ordinary_lenses_lose_no_pixel_and_keep_the_frame_of_pycolmap(
 
 @pytest.mark.sampled(4)
 @pytest.mark.parametrize("seed", range(12))
-def test_counted_pixels_increase_monotonically_from_the_centre_for_any_lens(seed: int) -> None:
+def test_the_distorted_radius_increases_from_the_centre_to_every_counted_pixel(seed: int) -> None:
     rng = np.random.default_rng(seed)
     extra = (rng.uniform(-0.6, 0.3), rng.uniform(-0.2, 0.2), *rng.uniform(-0.04, 0.04, 2))
     calibration = lens(("OPENCV", "OPENCV_FISHEYE")[seed % 2], (100, 105), extra)

@@ -51,7 +51,7 @@ def test_one_mask_is_not_used_for_photos_of_two_folders(tmp_path):
     assert found(tmp_path, ["p1.png"], "cam0/p2.png", "cam1/p1.png") == {"cam1/p1.png": "p1.png"}
 
 
-def test_the_default_folder_may_be_written_in_capitals(tmp_path):
+def test_the_default_mask_folder_may_be_written_in_capitals(tmp_path):
     assert find_mask_folder(None, tmp_path) is None
     (tmp_path / "Masks").mkdir()
     assert find_mask_folder(None, tmp_path) == tmp_path / "Masks"

@@ -62,7 +62,7 @@ def test_masks_are_decoded_by_the_check(folder):
         check_photos(scene.test_views, keep=False)
 
 
-def test_the_required_memory_is_that_of_all_decoded_photos():
+def test_the_memory_check_counts_all_decoded_photos():
     scene = sample_scene()
     large = [replace(v, camera=v.camera.resized(1024, 1024)) for v in scene.views]
     scene = replace(scene, views=tuple(large))

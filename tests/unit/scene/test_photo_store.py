@@ -90,7 +90,7 @@ def test_a_changed_origin_counts_as_another_photo(store, folder):
 
 
 def test_a_damaged_entry_is_not_used(store, folder):
-    """Any byte changed, any length but the right one: decoded and kept again."""
+    """After any changed byte or length, the photo is decoded and stored again."""
     source, rng = large(3), np.random.default_rng(0)
     whole = store.decoded(source)
     (entry,) = files(folder)
@@ -113,7 +113,7 @@ def test_a_damaged_entry_is_not_used(store, folder):
         assert entry.read_bytes() == good
 
 
-def test_the_checksum_of_an_entry_is_verified_again_only_after_other_use(
+def test_the_checksum_of_an_entry_is_verified_only_after_another_store_used_it(
     store, folder, monkeypatch
 ):
     source, sums = large(3), []

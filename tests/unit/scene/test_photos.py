@@ -211,7 +211,7 @@ def test_the_cache_stays_within_its_limit(small_cache):
         assert small_cache.used <= max(50_000, size)
 
 
-def test_a_walk_over_twice_the_memory_reaches_a_good_hit_rate(small_cache):
+def test_photos_of_twice_the_cache_size_in_random_order_have_a_good_hit_rate(small_cache):
     sources = [Counting() for _ in range(100)]
     rng = np.random.default_rng(0)
     for _ in range(10):

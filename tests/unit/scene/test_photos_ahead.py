@@ -95,7 +95,7 @@ def test_expected_photos_are_decoded_even_if_memory_cannot_hold_all_photos(log):
     assert not ahead.useful
 
 
-def test_at_most_twice_the_memory_is_expected_ahead(log):
+def test_at_most_twice_the_photo_memory_is_decoded_ahead(log):
     sources = [Source(number, log) for number in range(8)]
     views, ahead = views_of(sources, limit=6500), PhotosAhead()
     with ahead.at_work([], pytest.fail, keep=False):

@@ -98,6 +98,6 @@ def test_a_camera_too_far_for_single_precision_is_refused():
     refused(lambda: check_distances(scene, checked, frame), "too far", "b.jpg")
 
 
-def test_cameras_at_nearly_equal_positions_keep_a_finite_scale():
+def test_a_scene_with_nearly_equal_camera_positions_has_a_finite_scale():
     frame = make_frame(np.array([[0.0, 0, 0], [1e-310, 0, 0]]), np.zeros((0, 3)))
     assert frame.similarity.scale == 1.0

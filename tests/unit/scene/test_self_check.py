@@ -73,14 +73,14 @@ def causes(verdict):
 
 
 @pytest.mark.parametrize("tracks", [True, False])
-def test_a_correct_scene_agrees(model, tracks):
+def test_the_self_check_of_a_correct_scene_reports_no_contradiction(model, tracks):
     verdict = found(model if tracks else without_tracks(model))
     assert not causes(verdict)
     assert verdict.correlation > 0.8
     assert verdict.compared == 16
 
 
-def test_the_search_covers_all_kinds_of_contradictions(contradictions):
+def test_the_self_check_is_tested_with_all_kinds_of_contradictions(contradictions):
     assert tuple(contradictions.KINDS) == KINDS
 
 
@@ -102,7 +102,7 @@ def test_each_kind_of_contradiction_is_reported_with_cause_or_photos(
 
 
 @pytest.mark.parametrize("kind", ["OpenGL axes", "camera-to-world poses", "scaled points"])
-def test_the_cause_is_found_without_tracks(contradictions, model, kind):
+def test_the_cause_of_a_contradiction_is_found_without_tracks(contradictions, model, kind):
     wrong = contradictions.KINDS[kind](without_tracks(model), np.random.default_rng(0))
     assert any(word in cause for word in wrong.causes for cause in causes(found(wrong.model)))
 
@@ -118,7 +118,7 @@ def test_a_rotated_camera_without_tracks_is_named(model, axis):
     assert cause.views == (5,)
 
 
-def test_the_cause_is_found_if_the_colours_of_the_points_are_noisy(contradictions, model):
+def test_the_cause_of_a_contradiction_is_found_if_point_colours_are_noisy(contradictions, model):
     noise = np.random.default_rng(0).normal(0.0, 130.0, model.colors.shape)
     colors = np.clip(model.colors + noise, 0, 255).astype(np.uint8)
     right = replace(without_tracks(model), colors=colors)
@@ -233,7 +233,7 @@ def test_evenly_spread_photos_of_a_very_large_scene_are_checked(model):
     assert 0 < few.check["compared"] < len(scene.views)
 
 
-def test_equal_poses_equal_photos_and_points_at_infinity_are_noted(model):
+def test_the_self_check_notes_equal_poses_equal_photos_and_points_at_infinity(model):
     rotations, centers = model.rotations.copy(), model.centers
     rotations[2], centers[2] = rotations[1], centers[1]
     photos = list(model.photos)
@@ -250,7 +250,7 @@ def test_equal_poses_equal_photos_and_points_at_infinity_are_noted(model):
     assert "1 point extremely far away" in notes
 
 
-def test_dark_and_blurred_photos_are_noted(model):
+def test_the_self_check_notes_dark_and_blurred_photos(model):
     photos = list(model.photos)
     photos[3] = (photos[3] // 60).astype(np.uint8)
     height, width = photos[5].shape[:2]

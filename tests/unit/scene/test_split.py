@@ -18,7 +18,7 @@ def test_every_eighth_photo_by_name_is_held_out(tmp_path):
     assert "24 train, 4 test" in result.notes[0]
 
 
-def test_folders_are_split_separately(tmp_path):
+def test_photo_folders_are_split_separately(tmp_path):
     names = [f"street/{k}.jpg" for k in range(5)] + [f"aerial/{k}.jpg" for k in range(3)]
     assert split(names, tmp_path).test == ("aerial/0.jpg", "street/0.jpg")
     assert split(names, tmp_path, test_every=2).test == (
@@ -40,7 +40,7 @@ def test_folders_are_split_separately(tmp_path):
         (["1/a", "2/a", "3/a", "4/a", "5/a", "6/a", "7/a", "8/a", "9/a"], ("1/a", "9/a")),
     ],
 )
-def test_few_views_always_leave_one_training_view(names, test, tmp_path):
+def test_a_split_of_few_views_leaves_at_least_one_training_view(names, test, tmp_path):
     result = split(names, tmp_path)
     assert result.test == test
     assert result.train
@@ -101,7 +101,7 @@ def test_the_regimes_of_each_candidate_split_use_its_training_views(tmp_path):
     assert sorted(set(asked)) == [24, 28]
 
 
-def test_lists_and_other_split_methods_need_no_regimes(tmp_path):
+def test_splits_by_lists_or_by_every_nth_photo_need_no_regimes(tmp_path):
     def label(_train):
         raise AssertionError
 
@@ -143,7 +143,7 @@ def test_a_split_given_by_the_input_is_kept(tmp_path):
     assert split(NAMES, tmp_path, given=given).test == ("02.jpg",)
 
 
-def test_names_in_both_lists_are_refused(tmp_path):
+def test_names_in_both_split_lists_are_refused(tmp_path):
     for name in ("train_list.txt", "test_list.txt"):
         (tmp_path / name).write_text("05.jpg\n")
     with pytest.raises(UserError, match=r"for both training and testing(?s:.*)05\.jpg"):
@@ -151,7 +151,7 @@ def test_names_in_both_lists_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "5.jpg\n"])
-def test_lists_without_a_training_view_are_refused(text, tmp_path):
+def test_split_lists_without_a_training_view_are_refused(text, tmp_path):
     (tmp_path / "train_list.txt").write_text(text)
     with pytest.raises(UserError, match="no listed view can be used for training"):
         split(NAMES, tmp_path)

@@ -31,7 +31,7 @@ def test_tracks_of_a_written_scene_are_exact(model, tmp_path):
     assert scene.compute_mean_track_length() > 3
 
 
-def test_folders_become_rings_at_three_times_the_distance(tmp_path):
+def test_each_folder_of_a_tiny_scene_is_a_ring_at_three_times_the_previous_distance(tmp_path):
     scene = load(write_tiny_scene(tmp_path, views=4, folders=("near", "mid", "far"), mixed=True))
     distance = {}
     for image in scene.images.values():

@@ -77,7 +77,7 @@ def test_a_grid_without_a_name_gives_a_best_grid_without_a_name(swept, tmp_path)
     assert "name" not in best_grid(nameless, cells, standings, tmp_path)[0]
 
 
-def test_a_metric_to_minimize_selects_the_smallest_value(swept, tmp_path):
+def test_a_metric_to_minimize_selects_the_parameter_value_with_the_smallest_result(swept, tmp_path):
     grid, cells, standings = swept
     metric = grid.metric.model_copy(update={"goal": "minimize"})
     content, _ = best_grid(grid.model_copy(update={"metric": metric}), cells, standings, tmp_path)
@@ -100,7 +100,7 @@ def with_ends(swept, ends):
     return grid, cells, found
 
 
-def test_values_are_compared_on_the_same_seeds(swept, tmp_path):
+def test_parameter_values_are_compared_on_the_same_seeds(swept, tmp_path):
     # Seed 4 has higher figures: a mean over it alone would win.
     left = with_ends(swept, {("one, rate_factor=0.5", "town", 2): "interrupted"})
     with pytest.raises(UserError, match="2 of 3 values finished"):

@@ -125,7 +125,7 @@ def test_a_run_whose_folder_is_locked_waits(work):
     assert [each.state for each in state(given)] == ["finished", "finished"]
 
 
-def test_every_work_object_has_a_separate_stop():
+def test_each_sweep_work_has_a_separate_stop_request():
     one, other = (Work([], Path(), Path(), 1) for _ in range(2))
     one.stop.count += 1
     assert other.stop == Stop()

@@ -77,7 +77,7 @@ def counts(**busy):
         ({}, (0, 1, 2, 3)),
     ],
 )
-def test_idle_cores_are_used_first(monkeypatch, tmp_path, busy, expected):
+def test_a_sweep_uses_idle_cores_first(monkeypatch, tmp_path, busy, expected):
     looks = counts(**busy)
     file = tmp_path / "stat"
     monkeypatch.setattr(machine, "_COUNTS", file)

@@ -35,7 +35,7 @@ def ids(folder, scene, **base):
     return [job.id for job in plan(folder, scenes=[str(scene)], base=base).jobs]
 
 
-def test_seeds_vary_slowest(scene, tmp_path):
+def test_seeds_vary_slowest_in_the_order_of_runs(scene, tmp_path):
     found = plan(
         tmp_path, scenes=[str(scene)], seeds=[5, 6], parameters={"views": {"values": [1, 2]}}
     )

@@ -16,7 +16,7 @@ def pairs(rows):
 
 @settings(suppress_health_check=[HealthCheck.too_slow])  # A busy machine is slow enough.
 @given(st.sets(st.tuples(*[st.sampled_from("abcd")] * 4), min_size=1))
-def test_a_design_contains_every_possible_pair_and_no_redundant_row(admitted):
+def test_a_pairwise_design_contains_every_possible_pair_and_no_redundant_row(admitted):
     chosen = pairwise(sorted(admitted))
     assert set(chosen) <= admitted
     assert pairs(chosen) == pairs(list(admitted))
@@ -29,7 +29,7 @@ def test_a_design_contains_every_possible_pair_and_no_redundant_row(admitted):
 @pytest.mark.parametrize(
     ("sizes", "most"), [((9, 21, 7, 9), 220), ((3, 3, 3, 3), 12), ((2, 5), 10)]
 )
-def test_designs_are_far_smaller_than_the_product(sizes, most):
+def test_pairwise_designs_are_far_smaller_than_the_full_product(sizes, most):
     rows = list(product(*(list("abcdefghijklmnopqrstuvwxyz"[:n]) for n in sizes)))
     chosen = pairwise(rows)
     largest, second = sorted(sizes)[-2:][::-1]

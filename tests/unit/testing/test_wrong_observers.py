@@ -119,5 +119,5 @@ def test_a_wrong_observer_is_refused_with_the_right_reason(check, make, words, s
 
 
 @pytest.mark.slow
-def test_a_buffer_of_constant_size_is_allowed():
+def test_an_observer_may_keep_a_buffer_of_constant_size():
     observers.nothing_piles_up(KeepsOnce)

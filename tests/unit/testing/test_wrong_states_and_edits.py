@@ -114,7 +114,7 @@ def test_randomly_drawn_weights_are_not_compared():
         operators.views_that_are_alike_count_alike(AtRandom)
 
 
-def test_a_window_over_the_last_steps_is_bounded():
+def test_a_state_that_covers_a_window_of_the_last_steps_counts_as_bounded():
     growth.require_bounded((min(step, 900) for step in range(10_000)), "sample")
 
 
@@ -123,7 +123,7 @@ def test_a_state_that_grows_for_3000_steps_is_refused():
         growth.require_bounded((max(step, 8) - 8 for step in range(10_000)), "sample")
 
 
-def test_numbers_letters_and_columns_count_as_size():
+def test_numbers_letters_and_tensor_columns_count_as_the_size_of_a_state():
     state = api.PluginState(
         {"name": "abc", "list": [1, 2]}, {"t": torch.zeros(5)}, {"r": torch.zeros(9, 2)}
     )

@@ -59,7 +59,7 @@ def expected(positions, steps, scales, quats):
 
 @pytest.mark.parametrize("count", [1, 2, 7, 1500])
 @pytest.mark.parametrize("kind", [torch.float32, torch.float64])
-def test_steps_are_stretched_along_the_axes(count, kind):
+def test_adam_steps_are_stretched_along_the_axes_of_their_gaussian(count, kind):
     positions, steps, scales, quats = gaussians(count, count)
     quats[count // 2] = 0.0
     want = expected(positions, steps, scales, quats)
@@ -72,14 +72,14 @@ def test_steps_are_stretched_along_the_axes(count, kind):
     assert (np.abs(found.double().numpy() - want) <= bound).all()
 
 
-def test_gaussians_of_one_size_take_the_plain_steps_of_adam():
+def test_equal_round_gaussians_take_the_plain_steps_of_adam():
     positions, steps, _, quats = gaussians(100, 3)
     found = positions.clone()
     step_along_axes(found, steps, torch.full((100, 3), -4.0), quats)
     assert torch.allclose(found, positions + steps, rtol=1e-6, atol=1e-7)
 
 
-def test_the_stretch_of_one_axis_is_limited():
+def test_the_step_factor_along_one_axis_of_a_gaussian_is_limited():
     scales = torch.tensor([[-50.0, 0.0, 50.0]] + [[0.0, 0.0, 0.0]] * 4)
     quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(5, 1)
     found = torch.zeros(5, 3)
@@ -130,8 +130,8 @@ def test_a_non_finite_gaussian_does_not_affect_other_gaussians():
 
 @pytest.mark.parametrize("kind", [torch.float32, torch.float64])
 @pytest.mark.parametrize("seed", range(20))
-def test_the_typical_size_uses_the_finite_middle_axes(seed, kind):
-    """NaN counts as longer than all."""
+def test_the_typical_size_is_the_median_of_the_finite_middle_axes_of_gaussians(seed, kind):
+    """In the order of axes, NaN counts as the longest length."""
     rng = np.random.default_rng(seed)
     scales = rng.normal(size=(rng.integers(1, 40), 3))
     odd = rng.random(scales.shape) < rng.choice([0.1, 0.6])
@@ -178,7 +178,7 @@ def with_backbone(backbone):
     return replace(setup, selection=replace(setup.selection, backbone=backbone))
 
 
-def test_a_derived_backbone_has_no_axes_unless_it_declares_them():
+def test_a_derived_backbone_has_no_gaussian_axes_unless_it_declares_them():
     assert axes_of(with_backbone(Vanilla())) == ("means", "scales", "quats")
     assert axes_of(with_backbone(Round())) is None
     first_state(with_backbone(Round()))
@@ -208,12 +208,12 @@ def setup_of(backbone="vanilla", **settings):
         ({"schedule": "absolute", "schedule_length": 10}, True),
     ],
 )
-def test_short_runs_use_steps_along_the_axes(settings, by_size):
+def test_short_runs_use_position_steps_along_the_axes_of_gaussians(settings, by_size):
     assert (axes_of(setup_of(**settings)) is not None) == by_size
 
 
 @pytest.mark.parametrize("backbone", BACKBONES)
-def test_a_step_moves_positions_along_the_axes(backbone):
+def test_a_step_moves_positions_along_the_axes_of_their_gaussians(backbone):
     moved = {}
     for way in ("extent", "per-axis"):
         setup = setup_of(backbone, position_lr=None if backbone in ANCHORS else way)

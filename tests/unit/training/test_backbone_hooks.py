@@ -107,7 +107,7 @@ def test_a_learning_rate_of_zero_freezes_a_block_of_vanilla():
     assert not torch.equal(state.parameters["means"], before["means"])
 
 
-def test_the_densifier_determines_its_steps_and_initial_values(assembled):
+def test_the_densifier_determines_its_edit_steps_and_the_initial_opacities(assembled):
     setup = assembled(densifier="reversing")
     assert setup.schedule.edits() == 1
     start = first_state(setup).parameters["opacities"]

@@ -128,7 +128,7 @@ def test_edits_after_the_end_of_a_run_cost_nothing(affordable, steps):
 
 
 @pytest.mark.parametrize("mode", ["scaled", "absolute"])
-def test_probe_steps_use_all_bands_and_levels_and_no_edits(mode):
+def test_speed_probe_steps_use_all_sh_bands_and_levels_without_edits(mode):
     schedule = _without_edits(Schedule.for_run(12_000, mode))
     steps = [*range(1, 12_001), budget._FULL_SIZE + 1, budget._FULL_SIZE + budget.PROBE_STEPS]
     assert all(schedule.collects(step) for step in steps)
@@ -139,7 +139,7 @@ def test_probe_steps_use_all_bands_and_levels_and_no_edits(mode):
 
 @pytest.mark.parametrize("views", ["1", "3", "1..2@0.5"])
 @pytest.mark.parametrize("name", ["full", "octaves", "strided"])
-def test_probe_steps_collect_statistics_and_use_all_bands(monkeypatch, name, views):
+def test_speed_probe_steps_collect_statistics_and_use_all_sh_bands(monkeypatch, name, views):
     settings = {"seconds": 10.0, "resolution": {"name": "full"}, "views_per_step": views}
     run = assemble(RunConfig.model_validate(settings), sample_scene(), "none")
     resolution = GROWING.get(name, run.selection.resolution)
@@ -228,7 +228,7 @@ def grown(step, schedule):
         (3000, lambda step, schedule: 0.06 if step < 1000 else 0.02),
     ],
 )
-def test_a_time_budget_is_met_even_if_the_probe_was_wrong(planned, cost):
+def test_a_time_budget_is_met_even_if_the_speed_probe_was_wrong(planned, cost):
     run, seconds = timed(140.0, planned, cost)
     assert seconds == pytest.approx(140.0, rel=0.01)
     assert run.schedule.total == run.schedule.lr_until
@@ -257,7 +257,7 @@ def test_a_used_up_time_budget_ends_the_run():
     assert seconds == 13.0  # the first look is after twelve steps
 
 
-def test_the_recorded_lengths_repeat_the_schedule_of_every_step():
+def test_the_recorded_lengths_reproduce_the_schedule_at_every_step():
     run, _ = timed(140.0, 3000, grown)
     revisions = run.config.revisions
     assert list(revisions) == run.hook.lengths
@@ -381,7 +381,7 @@ def test_future_steps_cost_more_if_photos_become_larger():
 @pytest.mark.sampled(4)
 @pytest.mark.parametrize("views", ["1", "3", "1..2@0.5"])
 @pytest.mark.parametrize("name", ["full", "octaves", "spectral", "strided"])
-def test_the_probe_separates_the_cost_per_pixel(monkeypatch, name, views):
+def test_the_speed_probe_separates_the_cost_per_pixel(monkeypatch, name, views):
     settings = {"seconds": 10.0, "resolution": {"name": "full"}, "views_per_step": views}
     run = assemble(RunConfig.model_validate(settings), sample_scene(), "none")
     resolution = GROWING.get(name, run.selection.resolution)
@@ -411,7 +411,7 @@ def test_reduced_photos_are_kept_when_the_length_changes():
     assert replay_length(run, 4).scaled_photos is run.scaled_photos
 
 
-def test_the_note_on_scales_follows_the_current_length():
+def test_the_note_on_render_scales_follows_the_current_length():
     settings = {"steps": 1000, "resolution": {"name": "octaves"}, "densifier": {"name": "none"}}
     run = assemble(RunConfig.model_validate(settings), sample_scene(), "none")
     told = [note for note in run.notes if note.startswith("resolution")]

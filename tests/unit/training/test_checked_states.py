@@ -122,7 +122,7 @@ def test_checkpoints_and_results_are_finite(kept, settings, step):
     assert len(sink.rewound) == 1 and sink.rewound[0] < step
 
 
-def test_a_pause_right_after_a_bad_step_rewinds_to_the_state_before():
+def test_a_pause_right_after_a_non_finite_step_rewinds_to_the_previous_state():
     step = CHECK_EVERY + 3
     sink = Watching()
     setup = watched(Poison(step), sink)
@@ -169,7 +169,7 @@ class Dropping:
 
 
 @pytest.mark.parametrize("part", ["parameters", "exp_avg", "exp_avg_sq"])
-def test_a_bad_state_is_not_continued(part):
+def test_a_run_with_a_non_finite_state_is_not_continued(part):
     sink = Watching()
     setup = watched(Poison(None), sink)
     state = first_state(setup)
@@ -184,7 +184,7 @@ def test_a_bad_state_is_not_continued(part):
     assert resumed.step == 4 and sink.rewound == []
 
 
-def test_a_bad_initial_state_is_named_at_once():
+def test_a_non_finite_initial_state_is_reported_at_once():
     sink = Watching()
     setup = watched(Poison(None), sink)
     state = first_state(setup)

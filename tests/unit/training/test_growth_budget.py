@@ -96,7 +96,7 @@ def test_every_growing_densifier_follows_the_budget_curve(name):
 
 
 def test_the_strongest_candidates_grow_first():
-    """What the curve leaves out is what the method itself would have taken last."""
+    """The growth curve leaves out the candidates that the densifier would add last."""
     found = {}
     for growth in ("unbounded", "budget"):
         setup = setup_of("adc", max_gaussians=60, growth=growth)
@@ -160,7 +160,7 @@ def test_pruned_gaussians_free_room_for_growth():
     ],
 )
 def test_growth_and_budget_follow_the_settings(settings, growth, bound):
-    """And the resolved configuration asks for the same, in so many words."""
+    """The resolved configuration contains the same values explicitly."""
     config = RunConfig.model_validate({"steps": 2_000, **settings})
     setup = assemble(config, sample_scene(), "none")
     assert (setup.numbers.growth, setup.numbers.max_gaussians) == (growth, bound)
@@ -217,7 +217,7 @@ def test_random_points_are_bounded_and_determined_by_the_seed():
 
 
 def test_random_points_ignore_the_indices_of_sfm_points():
-    """A scene with more SfM points than random ones: views know them by large rows."""
+    """The scene has more SfM points than random points, so views refer to large row numbers."""
     scene = sample_scene()
     rows = np.arange(30_000) % len(scene.points)
     views = tuple(replace(view, seen=np.array([29_999])) for view in scene.views)
@@ -328,7 +328,7 @@ def test_runs_with_few_passes_over_large_photos_have_a_larger_budget(settings, m
 
 @pytest.mark.parametrize("longer", [700, 3_000, 5_000])
 def test_a_changed_length_still_reaches_the_budget(longer):
-    """The edits that are left share what is left, however many they have become."""
+    """The remaining growth is divided among the remaining edits."""
     counting = Counting("views", ViewsPerStepSpec((1,)), 50, min_refinements=6)
     first = Schedule.for_run(2_000, counting=counting)
     turn = first.step_of(first.next_edit(first.densify_from + first.densify_every))
@@ -381,7 +381,7 @@ def test_invalid_budgets_are_refused(text):
         RunConfig(max_gaussians=text)
 
 
-def test_no_growth_is_allowed_between_edits():
+def test_no_growth_is_allowed_after_the_end_of_density_control():
     setup = setup_of("adc")
     schedule = replace(setup.schedule, densify_until=2)
     state = SimpleNamespace(step=5)

@@ -68,7 +68,7 @@ class Both:
 
 
 @pytest.mark.parametrize("most", [0.2, 2.0])
-def test_rates_beyond_single_precision_are_infinite_without_a_warning(monkeypatch, most):
+def test_learning_rates_beyond_single_precision_are_infinite_without_a_warning(monkeypatch, most):
     monkeypatch.setattr(late, "MOST_ROWS", most)
     both = Both(torch.zeros(10, 3))
     both.step(np.arange(4), np.ones((4, 3), np.float32), 1e300, AdamRule())
@@ -420,7 +420,7 @@ def test_wrappers_of_the_aggregation_get_dense_gradients():
 
 
 def test_unordered_sparse_gradients_are_sorted_and_merged():
-    """Rows in any order or twice, as autograd and a wrapper's sums leave them."""
+    """Autograd and sums of wrappers return rows in any order and more than once."""
     rows, values = torch.tensor([4, 1, 4]), torch.tensor([[1.0], [2.0], [4.0]])
     found = coalesced(sparse_rows(rows, values, (6, 1)))
     assert rows_of(found).tolist() == [1, 4] and values_of(found).tolist() == [[2.0], [5.0]]

@@ -28,7 +28,7 @@ def test_weights_give_a_weighted_mean_over_the_unmasked_pixels(mask, share):
     assert float(found) == pytest.approx(expected, rel=1e-5)
 
 
-def test_the_reference_without_weights_equals_equal_weights():
+def test_the_reference_loss_without_weights_equals_the_loss_with_equal_weights():
     plain = l1_ssim_loss(IMAGE, PHOTO, MASK)
     weighted = l1_ssim_loss(IMAGE, PHOTO, MASK, 0.2, torch.full((20, 16), 3.0))
     assert float(plain) == pytest.approx(float(weighted), rel=1e-6)

@@ -85,7 +85,7 @@ def aside(means, seed):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("offset", OFFSETS)
-def test_a_moved_scene_is_the_same_to_2e_9_and_its_psnr_within_the_spread(
+def test_a_moved_scene_equals_the_original_to_2e_9_and_its_psnr_within_the_spread_of_runs(
     tmp_path, in_place, spread, offset
 ):
     moved = written(tmp_path / "moved", offset=offset)

@@ -38,7 +38,7 @@ needs_device = pytest.mark.skipif(FRESH not in os.environ, reason="run in a proc
 @pytest.mark.slow
 @pytest.mark.skipif(counted.REGISTER is None, reason="this torch has no backends in Python")
 def test_the_device_tests_of_this_file_pass_in_a_separate_process(request):
-    """Runs the tests of this file that need the device."""
+    """Run the tests of this file that need the device."""
     config = request.config
     command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider"]
     command += ["-c", str(config.inipath), "--rootdir", str(config.rootpath), __file__]
@@ -133,10 +133,7 @@ def steps(setup, count):
     ids=str,
 )
 def test_a_step_reads_back_from_the_device_twice_for_any_k(rasterizer, options):
-    """For the losses, and for the Gramians or what tells whether gradients are finite.
-
-    What the first step copies there once, later ones find.
-    """
+    """A step reads the losses, and the Gramians or the check for finite gradients."""
     found, record = steps(on_gpu(rasterizer, **options), 3)
     assert found[1:] == [[READ, kind(options)]] * 2
     assert all(loss > 0.0 for loss in record.losses)
@@ -226,7 +223,7 @@ class NumbaTogether(NumbaRasterizer):
     ids=str,
 )
 def test_views_rendered_together_train_like_views_rendered_one_by_one(options):
-    """The same losses, statistics and parameters, to the last bit, from one backward pass."""
+    """One backward pass gives the same losses, statistics and parameters to the last bit."""
     config = {"steps": 100, "metrics": [{"name": "psnr"}], **options}
     setup = assemble(RunConfig.model_validate(config), sample_scene(), "none")
     ends = []

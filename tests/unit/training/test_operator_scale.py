@@ -91,7 +91,7 @@ def test_bundled_operators_have_the_specified_scales(name, views):
 
 
 @pytest.mark.parametrize("granularity", ["kind", "global", "gaussian"])
-def test_every_granularity_has_the_same_scale(granularity):
+def test_every_granularity_of_an_operator_has_the_same_scale(granularity):
     operator = build("operators", "nash", {"granularity": granularity})
     assert scale_of(operator, 3).per_step == pytest.approx(dict.fromkeys(TENSORS, sqrt(3)))
 
@@ -128,7 +128,7 @@ def test_a_third_party_operator_is_evaluated_once_for_each_number_of_views():
     assert [len(context.losses) for context in Fivefold.asked] == [2, 3]
 
 
-def test_the_probe_of_an_operator_distinguishes_views_only_by_labels():
+def test_views_differ_only_by_labels_when_the_scale_of_an_operator_is_measured():
     Fivefold.asked.clear()
     context = aggregate_context(sample_gradients(3))
     OperatorScale(Fivefold()).of(replace(context, scales=(1.0, 0.5, 0.25)))
@@ -152,7 +152,7 @@ def test_the_scale_of_an_operator_with_its_own_aggregation_uses_this_aggregation
     assert scale.to_sum == {"means": 2.0, "f_dc": 2.0, "net.weight": 1.0, "net.bias": 1.0}
 
 
-def test_measuring_the_scale_does_not_change_the_step():
+def test_measuring_the_scale_of_an_operator_does_not_change_the_step():
     context = aggregate_context(sample_gradients(2))
     drawn = np.random.default_rng(0).bit_generator.state
     OperatorScale(build("operators", "graddrop", {})).of(context)
@@ -177,7 +177,7 @@ def test_non_finite_results_are_refused_with_operator_and_tensor():
     assert "Overflowing" in str(caught.value) and "means" in str(caught.value)
 
 
-def test_regularizer_terms_are_added_in_proportion_to_equal_gradients():
+def test_regularizer_terms_get_the_scale_that_the_operator_gives_equal_gradients():
     scale = Scale.of({"a": 3.0, "b": 1.5, "c": 0.0}, 3)
     one = torch.ones(2)
     of_views = {"a": 10 * one, "b": 10 * one, "c": 10 * one}

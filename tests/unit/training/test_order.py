@@ -36,7 +36,7 @@ def random_parameters(count, seed=0):
     return {"means": means, "codes": torch.arange(float(count)), "shared": torch.ones(2)}
 
 
-def test_rows_are_in_morton_order():
+def test_primitives_are_sorted_in_morton_order():
     positions = torch.cat([torch.randn(500, 3), torch.randn(50, 3) * 1e3, torch.zeros(2, 3)])
     rows = along_curve(positions)
     assert rows.tolist() == sorted(range(552), key=lambda i: (code(positions[i].tolist()), i))
@@ -45,8 +45,8 @@ def test_rows_are_in_morton_order():
 @pytest.mark.parametrize(
     ("far", "place"), [(torch.nan, 0), (-torch.inf, 0), (torch.inf, 2), (1e38, 2)]
 )
-def test_positions_without_a_cell_are_sorted_to_the_end(far, place):
-    """Where x is not a number or left of all cells it counts as the first cell, else the last."""
+def test_positions_without_a_cell_are_sorted_to_the_start_or_the_end(far, place):
+    """A position is first if x is NaN or below all cells, and last if x is above all cells."""
     positions = torch.tensor([[0.0, 0.0, 0.0], [far, 0.0, 0.0], [1.0, 0.0, 0.0]])
     assert along_curve(positions).tolist().index(1) == place
 
@@ -76,7 +76,7 @@ def test_parameters_without_a_tensor_of_positions_are_not_reordered(name):
 
 @pytest.mark.parametrize("backbone", ["vanilla", "mip", "scaffold", "octree"])
 def test_a_step_with_an_edit_reorders_all_rows_together(backbone, monkeypatch):
-    """An edit that turns all around: moments and a plugin's rows stay with their primitives."""
+    """The edit reverses the order. Moments and plugin rows stay with their primitives."""
     config = RunConfig.model_validate({"steps": 10, "backbone": {"name": backbone}})
     setup = assemble(config, sample_scene(), "none")
     state = first_state(setup)
@@ -98,7 +98,7 @@ def test_a_step_with_an_edit_reorders_all_rows_together(backbone, monkeypatch):
     assert torch.equal(state.moments.exp_avg_sq[name][:, 2], found)
 
 
-def test_a_run_is_in_order_after_each_of_its_edits():
+def test_gaussians_are_in_morton_order_after_each_edit_of_a_run():
     given = {"steps": 60, "densify_from": 5, "densify_every": 5, "densify_until": 50}
     setup = assemble(
         RunConfig.model_validate({**given, "schedule_unit": "steps"}), sample_scene(), "none"

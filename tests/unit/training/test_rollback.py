@@ -260,7 +260,7 @@ def test_a_failing_check_does_not_prevent_the_rollback(monkeypatch):
 
 
 def test_only_checked_states_are_saved_as_checkpoints():
-    """A parameter that nothing draws any more is looked for before it is saved."""
+    """A parameter that no view renders any more is also checked before it is saved."""
     setup = assembled()
     state = first_state(setup)
     results = Results()

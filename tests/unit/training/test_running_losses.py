@@ -74,7 +74,7 @@ def test_gradnorm_compares_with_the_loss_at_the_start_of_the_same_octave():
     assert gradnorm_rates(*full, *half, (0.2, 0.4, 1.0))[0] == pytest.approx([0.5, 1.0])
 
 
-def test_gradnorm_keeps_its_state_of_full_size():
+def test_at_full_size_the_state_of_gradnorm_has_no_additional_entries():
     _, losses = gradnorm_rates((0.4, 0.4, 1.0))
     assert losses["a"].keys() == {"count", "start", "average"}
     assert PluginState({"losses": losses})

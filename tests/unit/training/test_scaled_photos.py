@@ -100,7 +100,7 @@ def resized(view, width, height):
 VIEWS = sample_scene().train_views  # 24 x 16 pixels
 
 
-def test_the_last_requested_size_is_computed_once():
+def test_consecutive_requests_for_the_same_photo_size_compute_it_once():
     view, full, photos = VIEWS[0], Counted(), ScaledPhotos(1)
     first = photos.get(view, resized(view, 20, 13), full)
     assert photos.get(view, resized(view, 20, 13), full)[0] is first[0]
@@ -135,7 +135,7 @@ def test_memory_is_bounded_and_evicted_photos_are_computed_again():
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 2), st.integers(1, 24)), max_size=12), st.integers(0, 3))
 @example([(1, 1), (1, 3)], 1)  # on the way to one pixel lies the size that is wanted next
-def test_earlier_requests_change_no_pixel(asked, room):
+def test_earlier_requests_for_a_scaled_photo_change_no_pixel(asked, room):
     photos = ScaledPhotos(room)
     photos._room = room * 1000
     for index, width in asked:

@@ -46,7 +46,7 @@ def test_a_run_from_a_ply_starts_with_all_bands_of_the_file(trained):
     assert with_length(again, 10, 2000).schedule.sh_from == 3
 
 
-def test_the_ply_and_its_degree_are_recorded(trained, monkeypatch):
+def test_the_initial_ply_and_its_sh_degree_are_recorded(trained, monkeypatch):
     path = trained[2]
     monkeypatch.chdir(path.parent)
     config = RunConfig.model_validate({"steps": 1000, "data": {"init": path.name}})

@@ -33,7 +33,9 @@ CORNERS = [(2, 0, 0), (2, 1, 0), (2, 0, 1), (2, 1, 1), (3, 2, 1), (4, 3, 3), (5,
 
 @pytest.mark.parametrize("response", ["plain", "antialiased"])
 @pytest.mark.parametrize(("stride", "column", "row"), CORNERS)
-def test_the_reference_renders_exact_pixels_of_the_full_image(stride, column, row, response):
+def test_the_strided_reference_renders_exact_pixels_of_the_full_image(
+    stride, column, row, response
+):
     camera = posed_camera(46, 34)
     # Nobody stands beyond the border, where positions are clamped by the size of the image.
     gaussians = random_gaussians(40, camera, sigmas=(0.05, 4.0), border=0.0, response=response)
@@ -48,7 +50,7 @@ def test_the_reference_renders_exact_pixels_of_the_full_image(stride, column, ro
 
 
 @pytest.mark.parametrize(("stride", "column", "row"), CORNERS)
-def test_kernels_render_exact_pixels_of_the_full_image(stride, column, row):
+def test_strided_kernels_render_exact_pixels_of_the_full_image(stride, column, row):
     camera = posed_camera(64, 48, focal=60.0)
     gaussians = random_gaussians(300, camera, sigmas=(0.2, 5.0), border=0.0).mapped(
         torch.Tensor.float
@@ -62,7 +64,7 @@ def test_kernels_render_exact_pixels_of_the_full_image(stride, column, row):
     assert (drawn - whole[row::stride, column::stride]).abs().mean() < 1e-5
 
 
-def test_gradients_of_all_corners_add_up_to_the_gradient_of_the_full_image():
+def test_gradients_of_all_pixel_corners_add_up_to_the_gradient_of_the_full_image():
     camera = posed_camera(22, 16)
     start, torch_ = random_gaussians(20, camera, border=0.0), build("rasterizers", "torch", {})
     photo = torch.rand(16, 22, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
@@ -83,7 +85,7 @@ def test_gradients_of_all_corners_add_up_to_the_gradient_of_the_full_image():
 
 
 @pytest.mark.parametrize("stride", [2, 3, 4])
-def test_every_corner_is_used_equally_for_any_sampler_period(stride):
+def test_every_pixel_corner_is_used_about_equally_for_any_sampler_period(stride):
     for period in (1, 2, 3, 4, 7, 112):
         turns = Counter(corner_of(step, 0, stride) for step in range(1, 4000 * period, period))
         assert len(turns) == stride**2
@@ -95,7 +97,7 @@ def test_every_corner_is_used_equally_for_any_sampler_period(stride):
 @pytest.mark.parametrize(
     ("scale", "stride"), [(1.0, 1), (0.5, 2), (1 / 3, 3), (0.25, 4), (0.6, 1), (0.45, 1), (0.2, 5)]
 )
-def test_strides_exist_for_scales_of_whole_number_ratios_only(scale, stride):
+def test_strides_exist_only_for_render_scales_that_divide_the_size_by_a_whole_number(scale, stride):
     assert stride_of(scale, posed_camera()) == stride
 
 
@@ -104,7 +106,7 @@ def test_no_stride_exceeds_the_size_of_the_photo():
     assert stride_of(1 / 8, posed_camera(9, 7)) == 1
 
 
-def test_masks_are_sampled_at_the_same_pixels():
+def test_masks_are_sampled_at_the_pixels_of_the_strided_render():
     image = torch.arange(5 * 7 * 3, dtype=torch.uint8).reshape(5, 7, 3)
     mask = image[..., 0] > 40
     small, kept = pixels_of((image, mask), 2, (1, 0))
@@ -124,7 +126,7 @@ def test_masks_are_sampled_at_the_same_pixels():
         (5, 3, 1 / 2, 1),
     ],
 )
-def test_every_photo_keeps_enough_pixels(width, height, scale, expected):
+def test_every_photo_keeps_enough_pixels_under_strided_rendering(width, height, scale, expected):
     resolution = build("resolutions", "strided", {})
     assert 1 / resolution.of_photo(posed_camera(width, height), scale) == pytest.approx(expected)
 
@@ -146,7 +148,7 @@ def scene_of(width, height):
          "8 x 8 to step 48, of each 4 x 4 to step 96, of each 2 x 2 to step 160"),
     ],
 )  # fmt: skip
-def test_stages_follow_the_size_of_the_photos(width, height, coarsest, scales, note):
+def test_strided_stages_follow_the_size_of_the_photos(width, height, coarsest, scales, note):
     scene, schedule = scene_of(width, height), Schedule.for_run(200)
     resolution = build("resolutions", "strided", {}).fitted_to(scene)
     assert resolution.coarsest == coarsest
@@ -174,7 +176,7 @@ def test_stages_follow_the_size_of_the_photos(width, height, coarsest, scales, n
     ("steps", "share"),
     [(100, 0.8), (3000, 0.8), (9487, 0.4), (29_999, 0.0), (30_000, 0.0), (40_000, 0.0)],
 )
-def test_longer_runs_reach_all_pixels_earlier(steps, share):
+def test_longer_runs_render_all_pixels_from_an_earlier_share_of_the_run(steps, share):
     resolution = build("resolutions", "strided", {"coarsest": 2})
     schedule = Schedule.for_run(steps)
     assert resolution.window(schedule) == pytest.approx(share * steps, abs=2e-4 * steps)
@@ -233,7 +235,7 @@ def test_a_run_with_a_strided_share_of_zero_reports_so():
     assert "this share of the run is 0" in resolution.messages(Schedule.for_run(100))[0]
 
 
-def test_a_rasterizer_with_a_fixed_dilation_is_refused():
+def test_strided_rendering_refuses_a_rasterizer_with_a_fixed_dilation():
     gswarp, setup = build("rasterizers", "gswarp", {}), assembled()
     selection = replace(setup.selection, device="cuda", rasterizer=gswarp)
     told = gswarp.crossgrad_validate_selection(selection)
@@ -274,7 +276,7 @@ def test_rendered_pixels_are_photo_pixels_and_change_between_steps():
     assert target_at(setup, state, 0, 1.0, slot=0).stride == 1
 
 
-def test_a_response_that_averages_over_pixels_is_refused():
+def test_strided_rendering_refuses_a_response_that_averages_over_pixels():
     with pytest.raises(UserError, match="is a mean over all pixels"):
         assembled(backbone={"name": "analytic"})
 

@@ -145,7 +145,7 @@ def test_sum_and_mean_of_two_views_train_alike(backbone, densifier):
 
 @pytest.mark.parametrize("way", [pytest.param("extent", marks=pytest.mark.slow), "per-axis"])
 def test_sum_and_mean_of_three_views_train_alike(way):
-    """A third is no binary number: they differ less than runs from positions a bit aside."""
+    """1/3 is not a binary number. The runs differ less than runs from slightly moved positions."""
     of_sum = trained(setup_of("vanilla", "mcmc", "sum", 3, way=way))
     of_mean = trained(setup_of("vanilla", "mcmc", "mean", 3, way=way))
     aside = [trained(setup_of("vanilla", "mcmc", "sum", 3, way=way), seed=k) for k in range(3)]

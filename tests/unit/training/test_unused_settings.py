@@ -271,7 +271,7 @@ def test_labels_of_lists_can_be_selected(folders, tmp_path):
 
 
 def test_a_resumed_run_with_unused_settings_is_accepted(folders):
-    """Runs from before are continued as they were."""
+    """Runs of earlier versions continue with their settings."""
     config = RunConfig.model_validate(
         {
             "scene": str(folders),

@@ -79,7 +79,7 @@ def test_a_result_without_its_state_is_reported_with_the_method(word, slot, name
 
 
 @pytest.mark.parametrize("answer", [None, (1, 2)])
-def test_decode_must_return_gaussians(answer):
+def test_the_method_decode_must_return_gaussians(answer):
     error = refused(setup_of({"backbone": of_slot("backbones", "vanilla", "decode", answer)}))
     assert "Wrong.decode returned a value of a wrong type" in error.what
     assert error.expected == "Gaussians"
@@ -99,7 +99,7 @@ def test_backbones_must_create_exactly_the_tensors_of_their_blocks(answer):
     assert error.found == (", ".join(n for n, t in answer.items() if t is not None) or "none")
 
 
-def test_prepare_must_return_all_tensors_of_the_blocks():
+def test_the_method_prepare_must_return_all_tensors_of_the_blocks():
     backbone = of_slot("backbones", "vanilla", "prepare", {"means": torch.zeros(3, 3)})
     error = refused(setup_of({"backbone": backbone}))
     assert "Wrong.prepare returned tensors with other names" in error.what
@@ -121,7 +121,7 @@ def test_tensors_that_a_backbone_prepares_need_not_be_created():
 
 
 @pytest.mark.parametrize("answer", [3, ()])
-def test_more_points_must_return_points(answer):
+def test_the_method_more_points_must_return_points(answer):
     error = refused(
         setup_of({"initializer": of_slot("initializers", "points", "more_points", answer)})
     )
@@ -139,7 +139,9 @@ def test_more_points_must_return_points(answer):
         ),
     ],
 )
-def test_fitted_to_must_return_a_component_of_its_slot(monkeypatch, base, slot, name, answer):
+def test_the_method_fitted_to_must_return_a_component_of_its_slot(
+    monkeypatch, base, slot, name, answer
+):
     original, wrong = selecting.chosen, of_slot(slot, name, "fitted_to", answer)
 
     def built(kind, choice):
@@ -151,7 +153,7 @@ def test_fitted_to_must_return_a_component_of_its_slot(monkeypatch, base, slot, 
 
 
 @pytest.mark.parametrize("scales", ["a", (None,), ()])
-def test_scales_must_be_numbers(scales):
+def test_render_scales_must_be_numbers(scales):
     wrong = of_slot("resolutions", "full", "scales", (scales, PluginState()))
     assert refused(setup_of({"resolution": wrong})).what.startswith(
         "the resolution returned a wrong scale"
@@ -220,7 +222,7 @@ def test_correct_results_are_accepted():
 
 
 @pytest.mark.parametrize("name", sorted(TAKEN))
-def test_states_under_names_of_other_plugins_are_refused(name):
+def test_plugin_states_under_names_of_other_plugins_are_refused(name):
     plugin = Answers(DensifyResult(NO_EDIT, states={name: PluginState({"n": 1})}))
     error = refused(setup_of(stranger=plugin))
     assert repr(name) in error.what
@@ -347,7 +349,7 @@ def test_aggregated_gradients_must_fit_the_parameters(plugin, found):
     assert found in error.found
 
 
-def test_a_tensor_may_be_skipped_and_counts_may_be_numpy_numbers():
+def test_an_aggregation_may_skip_a_tensor_and_return_numpy_numbers_as_counts():
     counts = {"dropped": np.int64(2), "odd": torch.tensor(3)}
     setup = setup_of(
         wrapping=Wraps(lambda answer: replace(answer, counts=counts)), a=with_means(None)
@@ -364,19 +366,19 @@ def labelled(labels):
 
 
 @pytest.mark.parametrize("labels", [(), ("a", "b"), "a", 3, (3,), (None,), {"a": 1}])
-def test_labels_must_be_one_text_for_each_view(labels):
+def test_a_sampler_must_return_one_text_label_for_each_view(labels):
     error = refused(setup_of({"sampler": labelled(labels)}))
     assert error.what == "the sampler returned a wrong number of labels"
     assert "sampler epoch" in error.where
 
 
 @pytest.mark.parametrize("labels", [["a"], np.array(["a"])])
-def test_labels_may_be_a_list(labels):
+def test_a_sampler_may_return_its_labels_as_a_list(labels):
     setup = setup_of({"sampler": labelled(labels)})
     assert take_step(setup, first_state(setup)).labels == ("a",)
 
 
-def test_scales_given_as_numpy_numbers_become_numbers_in_the_record():
+def test_render_scales_given_as_numpy_numbers_become_python_numbers_in_the_record():
     wrong = of_slot("resolutions", "full", "scales", ((np.float32(0.5),), PluginState()))
     setup = setup_of({"resolution": wrong})
     scales = take_step(setup, first_state(setup)).scales
@@ -412,7 +414,7 @@ def test_a_state_with_new_names_is_checked_again():
         take_step(setup, state)
 
 
-def test_fresh_rows_without_new_primitives_lose_moments_and_statistics():
+def test_rows_marked_as_fresh_lose_moments_and_statistics_even_without_new_rows():
     fresh = torch.arange(40) < 3
     held = PluginState(per_primitive={"seen": torch.ones(40)})
     plugin = Answers(DensifyResult(NO_EDIT, states={"stranger": held}))
@@ -490,14 +492,14 @@ def test_an_invalid_number_format_of_a_metric_is_refused_before_the_run(monkeypa
     assert caught.value.found == repr(form)
 
 
-def test_any_number_of_group_labels_is_listed_in_the_objection():
+def test_group_labels_that_are_numbers_are_listed_in_the_objection():
     setup = setup_of({"sampler": build("samplers", "near-far", {})})
     names = {**setup.selection.names, "grouping": "odd"}
     selection = replace(setup.selection, names=names, labels=(0, 1, 2))
     assert "makes 3: 0, 1, 2" in " ".join(objections_to(selection))
 
 
-def test_groups_are_named_by_kind_for_any_block_names():
+def test_groups_of_blocks_are_named_by_their_kinds_for_any_block_names():
     rate = LearningRate(1.0)
     blocks = (
         Block("all", ("a",), True, "geometry", rate),
