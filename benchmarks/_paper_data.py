@@ -258,7 +258,7 @@ class Plan(_Part):
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure of the paper."""
+    """A number that the paper reports for a scene and a metric."""
 
     scene: str
     metric: str

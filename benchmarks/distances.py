@@ -88,7 +88,7 @@ class Probes:
         return [known[name] for name in sorted(band.names) if name in known]
 
     def title(self, band: Band) -> str:
-        """Return folder, sizes and number of measured views of a band, over all runs."""
+        """Return a band's folder, range of pixel sizes, and range of measured views per run."""
         runs = [run for own in self.runs.values() for run in own.values()]
         counts = sorted({len(self._measured(run, band)) for run in runs})
         views = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))

@@ -358,6 +358,17 @@ class RunConfig(BaseModel):
             )
         return value
 
+    @field_validator("decided")
+    @classmethod
+    def _are_settings(cls, value: dict[str, str]) -> dict[str, str]:
+        """Refuse a reason for something that is not a setting."""
+        for name in value:
+            setting, _, option = name.partition(".")
+            known = setting in cls.model_fields
+            if not known or (setting == "data" and option not in SceneOptions.model_fields):
+                raise ValueError(f"{name} is not a setting")
+        return value
+
     @field_validator("rules", mode="before")
     @classmethod
     def _rules(cls, value: object) -> object:

@@ -165,7 +165,7 @@ def _value(config: RunConfig, setting: str) -> object:
     if isinstance(value, ComponentChoice):
         return value.options.get(option) if option else value.name
     if name == RULES:
-        return value[option]
+        return value.get(option)
     return getattr(value, option) if option else value
 
 

@@ -15,8 +15,9 @@ from crossgrad_core.system.input_files import LARGEST, read_file
 # `int` and `float` also accept digits of other scripts, digit groups and spaces.
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?inf|nan", re.ASCII)
 _LONGEST_NUMBER = 400
-# Number of bytes in memory of a list, of a cell, of an object with one member, and of a value with
-# its position or key.
+# Bytes of memory for each character of a file. CSV: a line end adds a list, a comma adds a cell.
+# JSON: `[` adds a list, `{` adds an object with one member, and `,` and `:` add a value with its
+# position or key.
 _CSV = {b"\n": 160, b"\r": 160, b",": 60}
 _JSON = {b"[": 96, b"{": 240, b",": 64, b":": 64}
 

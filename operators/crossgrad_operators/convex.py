@@ -15,9 +15,9 @@ from crossgrad_operators._weights import Flags, Floats, extended_precision
 class MGDA(Weighting):
     """The shortest convex combination of the gradients: w minimizes |sum w_k g_k| on the simplex.
 
-    Two views use a closed form. More views use the active sets of Lawson and Hanson. Gradients in
-    float64 use 32 digits. |u| is at most the length of the shortest gradient. The result is zero
-    if a convex combination of the gradients is zero.
+    Two views use a closed form. More than two views are solved by the active-set method of Lawson
+    and Hanson. Gradients in float64 use 32 digits. |u| is at most the length of the shortest
+    gradient. The result is zero if a convex combination of the gradients is zero.
 
     Source: Désidéri 2012; Sener and Koltun 2018.
     """

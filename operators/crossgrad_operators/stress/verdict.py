@@ -166,7 +166,7 @@ def distance(case: Case, found: Tensor, expected: Answer) -> float:
     values = found.detach().double().numpy()
     head = case.head.shape[1]
     exact = weighted_sum(expected.weights, case.exact_head)
-    # Subtract in 50 digits, because the differences then need few digits.
+    # Subtract in 50 digits, because the leading digits cancel. Fewer digits then suffice.
     parts = [float(e - v) for v, e in zip(values[:head].tolist(), exact, strict=True)]
     if case.copies:
         pattern = np.array([float(v) for v in weighted_sum(expected.weights, case.exact_pattern)])

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
-#: Correlations that differ by less than this count as equal.
+#: Two correlations are treated as equal if their difference is below this value.
 _ROUNDING = 1e-9
 #: Number of decimals of a difference of logarithms that are kept. Further decimals are rounding
 #: errors.

@@ -244,7 +244,7 @@ def _check_rotations(quats: NDArray[np.float32], path: Path) -> None:
     wrong = (lengths < shortest) | (lengths > longest)
     if wrong.any():
         raise UserError(
-            "the PLY file contains a rotation whose length is zero, too small or too large",
+            "the PLY file contains a rotation quaternion whose length is too small or too large",
             where=path,
             expected=f"quaternions rot_0 ... rot_3 of length {shortest:g} to {longest:g}",
             found=f"{int(wrong.sum()):,} of {len(quats):,} outside this range",

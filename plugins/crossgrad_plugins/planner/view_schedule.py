@@ -75,7 +75,7 @@ def view_schedule(evidence: Evidence) -> Finding:
 
 
 def _schedule_of_two_modes(evidence: Evidence, plain: Finding) -> Finding:
-    """Decide by the viewing directions whether far views are drawn more often."""
+    """Use the viewing directions to decide whether far views are drawn more often."""
     if "sampler" in pairs(evidence).settings:
         return plain.found("a step has a near and a far view", decided=True)
     cut = evidence.modes.cut

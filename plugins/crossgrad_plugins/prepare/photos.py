@@ -72,8 +72,8 @@ _IMPOSSIBLE: Final = (
     "its name has control characters or backslashes, is too long or is not UTF-8: rename it"
 )
 _SMALLEST: Final = 64
-#: A JPEG file may have this many times as many pixels as other photos, because phones take photos
-#: of 200 megapixels.
+#: Factor on the largest number of pixels for JPEG files that the decoder can reduce. Phones take
+#: photos of 200 megapixels.
 _REDUCIBLE: Final = 2
 #: Approximate longest side in pixels of the reduced photos that are inspected.
 _LOOKED_AT: Final = 1024

@@ -239,7 +239,7 @@ def break_header(raw: bytes) -> bytes:
         (lambda raw: raw.replace(b"Mode: default", b"Mode: 2dgs"), "another renderer"),
         (lambda raw: raw.replace(b"SplatRenderMode:", b"crossgrad_offset:"), "coordinate offset"),
         (lambda raw: raw[:-8] + np.array([np.nan, 1], "<f4").tobytes(), "1 of 4 values of rot_2"),
-        (lambda raw: raw[:-16] + bytes(16), "rotation whose length is zero"),
+        (lambda raw: raw[:-16] + bytes(16), "rotation quaternion whose length is too small"),
     ],
 )
 def test_damaged_files_are_refused_with_the_reason(tmp_path: Path, damage, message: str):

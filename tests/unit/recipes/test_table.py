@@ -2,6 +2,7 @@
 
 import pytest
 import yaml
+from pydantic import ValidationError
 from support.scenes import write_tiny_scene
 
 import crossgrad_core as cg
@@ -99,6 +100,13 @@ def test_a_recipe_without_a_row_is_refused_with_the_name_of_the_setting(name, mo
     with pytest.raises(UserError, match="does not decide every setting") as caught:
         assembled(steps=30)
     assert caught.value.found == f"no row for {name}"
+
+
+@pytest.mark.parametrize("name", ["posithon_lr", "data.max_sise"])
+def test_a_reason_for_something_that_is_not_a_setting_is_refused(name):
+    with pytest.raises(ValidationError) as caught:
+        RunConfig(decided={name: "as published"})
+    assert f"{name} is not a setting" in str(caught.value)
 
 
 @pytest.mark.parametrize("steps", [30, 700, 3_000, 15_000, 60_000])

@@ -111,7 +111,7 @@ def _similar_folder(scene: Path) -> Path | None:
 def _no_model(scene: Path) -> UserError:
     below = sorted(path.name for path in scene.iterdir())
     return UserError(
-        "the scene has no COLMAP model, which contains the camera poses of the photos",
+        "the scene has no COLMAP model (the files with the camera poses of the photos)",
         where=scene,
         expected="images/ with the photos and sparse/0/ with cameras, images and points3D, as .bin "
         "or .txt",
