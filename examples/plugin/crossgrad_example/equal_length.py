@@ -7,10 +7,7 @@ from crossgrad_core.plugin import OperatorContext, Weighting
 
 
 class EqualLength(Weighting):
-    """An operator that scales the K gradients of a block to equal length, and adds the results.
-
-    This length is the mean length of the gradients.
-    """
+    """An operator that scales the K gradients of a block to their mean length and adds them."""
 
     def weights(
         self, gramians: NDArray[np.float64], context: OperatorContext
