@@ -60,7 +60,7 @@ class Code:
 
     @classmethod
     def of(cls, text: str) -> "Code":
-        """Return the code from a text `NAME=CROSSGRAD [OPTIONS]`."""
+        """Parse a text `NAME=CROSSGRAD [OPTIONS]` into a name, a command and its options."""
         name, _, words = text.partition("=")
         program, *options = shlex.split(words)
         return cls(name, program, tuple(options))

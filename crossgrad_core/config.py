@@ -364,8 +364,8 @@ class RunConfig(BaseModel):
         """Refuse a reason for something that is not a setting."""
         for name in value:
             setting, _, option = name.partition(".")
-            known = setting in cls.model_fields
-            if not known or (setting == "data" and option not in SceneOptions.model_fields):
+            options = SceneOptions.model_fields if setting == "data" else {option}
+            if setting not in cls.model_fields or option not in options:
                 raise ValueError(f"{name} is not a setting")
         return value
 

@@ -61,10 +61,10 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if item.get_closest_marker("sampled"):
             cases[item.nodeid.partition("[")[0]].append(item)
-    for every in cases.values():
-        (count,) = every[0].get_closest_marker("sampled").args
-        kept = {len(every) * place // count for place in range(count)}
-        for place, item in enumerate(every):
+    for function in cases.values():
+        (count,) = function[0].get_closest_marker("sampled").args
+        kept = {len(function) * place // count for place in range(count)}
+        for place, item in enumerate(function):
             if place not in kept:
                 item.add_marker(pytest.mark.slow)
 

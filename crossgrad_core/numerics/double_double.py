@@ -30,7 +30,7 @@ def quick_two_sum(a: float, b: float) -> tuple[float, float]:
 
 @strict_device
 def two_product(a: float, b: float) -> tuple[float, float]:
-    """Return the product and its rounding error; magnitudes below 1e150."""
+    """Return the product and its rounding error. Magnitudes must be below 1e150."""
     product = a * b
     scaled = _SPLITTER * a
     a_high = scaled - (scaled - a)

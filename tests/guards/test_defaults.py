@@ -75,7 +75,7 @@ def _is_name(node):
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT / CORE)))
-def test_no_core_file_names_a_plugin(path):
+def test_core_files_contain_no_plugin_names(path):
     assert not list(named(path.read_text(encoding="utf-8")))
 
 

@@ -63,7 +63,7 @@ def check(row, steps):
 
 @pytest.mark.sampled(12)
 @pytest.mark.parametrize("row", DESIGN, ids=" x ".join)
-def test_the_design_contains_all_pairs_of_exposures_backbones_and_views(row):
+def test_every_exposure_trains_with_every_backbone_and_number_of_views(row):
     check(row, FEW)
 
 

@@ -88,7 +88,7 @@ def check(row):
 
 @pytest.mark.sampled(7)
 @pytest.mark.parametrize("row", DESIGN, ids=" x ".join)
-def test_the_design_contains_all_pairs_of_resolutions_backbones_and_views(row):
+def test_every_resolution_trains_with_every_backbone_and_number_of_views(row):
     check(row)
 
 

@@ -80,7 +80,7 @@ def write_video(frames: list[Path], fps: float) -> Path | None:
 
 
 def _encode(encoder: str, frames: list[Path], target: Path, fps: float) -> None:
-    # The folder may contain more frames from a longer video.
+    # The folder may also contain frames of an earlier, longer video.
     source = ["-framerate", f"{fps:g}", "-i", str(frames[0].parent / "%05d.png")]
     count = ["-frames:v", str(len(frames))]
     # Players require even sides and this pixel format.

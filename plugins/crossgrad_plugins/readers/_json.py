@@ -189,7 +189,7 @@ def _number(value: object) -> float | None:
 
 
 def _flat(value: object, shape: tuple[int, ...]) -> Iterator[object]:
-    """Yield the values in nested lists of this shape; a list of another length yields no values."""
+    """Yield the values in nested lists of this shape. Skip lists of other lengths."""
     if not shape:
         yield value
     elif isinstance(value, list) and len(value) == shape[0]:

@@ -248,7 +248,7 @@ def test_nothing_changes_between_edits():
     assert edit_of(last) != NO_EDIT and edit_of(over) == NO_EDIT
 
 
-def test_a_run_grows_and_decreases_opacities():
+def test_a_run_grows_in_every_second_step_and_stays_finite():
     config = RunConfig(
         steps=10, densify_from=1, densify_until=9, densify_every=2, schedule_unit="steps",
         densifier=ComponentChoice(name="revising", growth_budget=0.1, error_threshold=0.01),

@@ -147,7 +147,7 @@ def test_photos_that_all_share_points_are_solved_exactly(count):
     assert np.abs(fit.gains - (planted - planted.mean())).max() < 1e-4
 
 
-def test_groups_without_shared_points_have_a_mean_of_zero_each():
+def test_each_group_without_shared_points_has_a_mean_gain_of_zero():
     one = observed(np.array([1.0, 3.0]), 20, 20, noise=0.0)
     other = observed(np.array([-5.0, -5.5]), 20, 20, noise=0.0)
     joined = Observations(
@@ -158,6 +158,7 @@ def test_groups_without_shared_points_have_a_mean_of_zero_each():
     )
     gains = fitted(joined, 4).gains
     assert gains[:2].mean() == pytest.approx(0.0, abs=0.05)
+    assert gains[2:].mean() == pytest.approx(0.0, abs=0.05)
     assert gains[1] - gains[0] == pytest.approx(2.0, abs=0.05)
     assert gains[3] - gains[2] == pytest.approx(-0.5, abs=0.05)
 

@@ -240,7 +240,7 @@ def test_a_time_budget_is_met_even_if_the_speed_probe_was_wrong(planned, cost):
 
 
 @pytest.mark.parametrize(("each", "steps"), [(0.01, 3000), (0.04, 2334), (0.08, 1168)])
-def test_a_time_budget_with_a_step_limit_ends_with_the_first_of_both(each, steps):
+def test_a_run_ends_at_its_time_budget_or_its_step_limit_whichever_comes_first(each, steps):
     run, state, length = setup(steps=3000), reached(0), Timed(93.33, most=3000)
     while state.step < run.schedule.total:
         state.step += 1
