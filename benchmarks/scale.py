@@ -147,7 +147,8 @@ def memory_cells(*, full: bool) -> Iterator[tuple[Cell, bool]]:
 
 def scene_of(cell: Cell) -> "Scene":
     """Return the scene of a cell."""
-    from crossgrad_core.contract.scene import Scene, Similarity
+    from crossgrad_core.contract.georeference import Similarity
+    from crossgrad_core.contract.scene import Scene
 
     width = round((cell.pixels * 1e6 * 4 / 3) ** 0.5)
     size = (width, round(width * 3 / 4))

@@ -49,6 +49,15 @@ from crossgrad_core.contract.contexts import (
 from crossgrad_core.contract.decision import Decision
 from crossgrad_core.contract.figure import Figure
 from crossgrad_core.contract.gaussians import Gaussians, Render, Response, Screen
+from crossgrad_core.contract.georeference import (
+    COORDINATES_TAG,
+    INPUT,
+    LOCAL,
+    Georeference,
+    Placed,
+    Similarity,
+    Unplaced,
+)
 from crossgrad_core.contract.gradients import Granularity, SeparateGradients
 from crossgrad_core.contract.gramian_operator import (
     GramianOperator,
@@ -59,17 +68,10 @@ from crossgrad_core.contract.gramian_operator import (
 )
 from crossgrad_core.contract.objections import objections_to_views, set_for_nothing
 from crossgrad_core.contract.scene import (
-    COORDINATES_TAG,
-    INPUT,
-    LOCAL,
     Camera,
-    Georeference,
     Photo,
     Pinhole,
-    Placed,
     Scene,
-    Similarity,
-    Unplaced,
     View,
     centers_of,
     footprint_of,
@@ -93,7 +95,7 @@ from crossgrad_core.contract.schedule import (
 from crossgrad_core.contract.selection import HasUnusedOptions, Selection
 from crossgrad_core.contract.slots.backbone import Backbone
 from crossgrad_core.contract.slots.densifier import Densifier
-from crossgrad_core.contract.slots.exporter import Exporter, Rounding
+from crossgrad_core.contract.slots.exporter import ExportContent, Exporter, Rounding
 from crossgrad_core.contract.slots.exposure import Exposure, Fitted, PerPhoto
 from crossgrad_core.contract.slots.grouping import (
     GradientProbe,
@@ -160,6 +162,7 @@ __all__ = [
     "DensifyResult",
     "Edit",
     "EvaluationReport",
+    "ExportContent",
     "Exporter",
     "Exposure",
     "Facts",

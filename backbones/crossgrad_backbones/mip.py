@@ -193,6 +193,10 @@ class MipSplatting(Vanilla):
         return torch.minimum(parameters["opacities"].detach(), limit)
 
     @override
+    def unbaked(self, parameters: Mapping[str, Tensor], phase: Phase) -> Gaussians:
+        return super().bake(parameters, phase, ())
+
+    @override
     def bake(
         self, parameters: Mapping[str, Tensor], phase: Phase, cameras: Sequence[Camera]
     ) -> Gaussians:

@@ -63,6 +63,14 @@ def evaluate(
     evaluate.evaluate(run, how, ply, on)
 
 
+class UpAxis(StrEnum):
+    """The axis of an exported file that points up."""
+
+    Y = "y"
+    Z = "z"
+    INPUT = "input"
+
+
 def export(  # noqa: PLR0913, PLR0917 - one parameter per option of the command line
     run: RunFolder,
     file_format: Annotated[
@@ -70,44 +78,90 @@ def export(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
         typer.Option(
             "--format",
             metavar="NAME",
-            help="Name of the exporter; ply writes the standard 3DGS file. Default: the "
-            "exporter of the run.",
+            help="Format of the file, the name of an exporter: `crossgrad plugins list` shows all. "
+            "Default: the exporter of the run.",
         ),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Path of the output file. Default: RUN/point_cloud.ply."),
+        typer.Option(metavar="FILE", help="The output file. Default: RUN/point_cloud.FORMAT."),
     ] = None,
     camera: Annotated[
         str | None,
         typer.Option(
             metavar="VIEW",
-            help="Bake view-dependent values for this view, into RUN/point_cloud_VIEW.ply. "
+            help="Bake view-dependent values for this view. "
             "Default: the mean of the training views.",
         ),
     ] = None,
     coordinates: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="input|local|enu|utm|epsg:N",
             help="Coordinates of the file: those of the scene files, those of the training, "
-            "metres east, north and up, or projected coordinates. Except for input, the "
-            "default path is RUN/point_cloud_COORDINATES.ply.",
+            "metres east, north and up, or projected coordinates. Default: input, for 3D Tiles "
+            "enu.",
         ),
-    ] = "input",
+    ] = None,
+    up: Annotated[
+        UpAxis | None,
+        typer.Option(
+            help="Rotate the scene so that this axis points up; input keeps the axes. Default: y "
+            "for formats that require it (glb), else input.",
+        ),
+    ] = None,
+    sh_degree: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N", min=0, max=3, help="Highest degree of spherical harmonics. Default: all."
+        ),
+    ] = None,
+    crop: Annotated[
+        str | None,
+        typer.Option(
+            metavar="BOX|FILE",
+            help="Export only a part: xmin,ymin,zmin,xmax,ymax,zmax, or a file with one corner "
+            "x,y of a polygon per line, in the coordinates of the exported file.",
+        ),
+    ] = None,
+    max_gaussians: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            min=1,
+            help="Keep the N Gaussians that contribute most to the training photos.",
+        ),
+    ] = None,
+    unbaked: Annotated[
+        bool,
+        typer.Option(
+            "--unbaked",
+            help="Store antialiased Gaussians (backbone mip) with the flag of the format, for "
+            "viewers that draw them.",
+        ),
+    ] = False,
     device: Device = None,
     threads: Threads = None,
     accept_scene: AcceptScene = False,
 ) -> None:
     """Write the trained scene to a file for viewers."""
     announce()
+    from crossgrad_core.run.export import ExportOptions
+    from crossgrad_core.run.export_edits import Crop
     from crossgrad_core.run.postprocess import export
     from crossgrad_core.run.postprocess.open_options import How
 
-    how = How(device, threads, accept_scene)
-    export.export(
-        run, file_format=file_format, out=out, camera=camera, coordinates=coordinates, how=how
+    options = ExportOptions(
+        camera=camera,
+        coordinates=coordinates,
+        up=up,
+        sh_degree=sh_degree,
+        crop=None if crop is None else Crop.parsed(crop),
+        max_gaussians=max_gaussians,
+        baked=not unbaked,
     )
+    how = How(device, threads, accept_scene)
+    export.export(run, file_format=file_format, out=out, options=options, how=how)
 
 
 class Split(StrEnum):

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from crossgrad_core.numerics.harmonics import harmonics_rotation
 from crossgrad_core.numerics.raster_constants import COEFFICIENTS
 
 Response = Literal["plain", "antialiased", "analytic"]
@@ -85,6 +86,29 @@ class Gaussians:
         mapped: dict[str, Any] = {n: function(t) for n, t in tensors.items() if t is not None}
         return replace(self, **mapped)
 
+    def rotated(self, rotation: Tensor, means: Tensor | None = None) -> "Gaussians":
+        """Return the same Gaussians, rotated about the origin.
+
+        A camera that is rotated in the same way sees the same image.
+
+        Args:
+            rotation: [3, 3] float64 on the CPU, orthonormal with determinant 1.
+            means: [N, 3] centres of the rotated Gaussians, if they are known more precisely.
+        """
+        quats = _quaternion_product(_quaternion(rotation), self.quats)
+        rest = self.sh_rest
+        if rest is not None:
+            degree = COEFFICIENTS.index(1 + rest.shape[1])
+            rest = harmonics_rotation(rotation, degree).to(rest) @ rest
+        if means is None:
+            means = (self.means.double() @ rotation.T.to(self.means.device)).to(self.means)
+        return replace(self, means=means, quats=quats, sh_rest=rest)
+
+    def selected(self, rows: Tensor) -> "Gaussians":
+        """Return the Gaussians that are marked in `rows` [N] bool, without their origins."""
+        chosen = self.mapped(lambda tensor: tensor[rows.to(tensor.device)])
+        return replace(chosen, origin=None, slot=None, decoded=None)
+
     def detached(self) -> "Gaussians":
         """Return the same Gaussians without their graph."""
         return self.mapped(torch.Tensor.detach)
@@ -144,6 +168,28 @@ class _Whole(Gaussians):
     @override
     def __reduce_ex__(self, protocol: SupportsIndex) -> tuple[type[Gaussians], tuple[Any, ...]]:
         return Gaussians, tuple(vars(self).values())
+
+
+def _quaternion(rotation: Tensor) -> Tensor:
+    """Return the unit quaternion [4] wxyz, float64, of a rotation matrix [3, 3]."""
+    # The largest eigenvector of this matrix is the quaternion, also for a rotation by 180 degrees
+    # (Bar-Itzhack 2000).
+    r = rotation.double()
+    matrix = torch.zeros((4, 4), dtype=torch.float64)
+    matrix[0, 0] = r.trace()
+    matrix[1:, 1:] = r + r.T - r.trace() * torch.eye(3, dtype=torch.float64)
+    matrix[0, 1:] = matrix[1:, 0] = torch.stack(
+        [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]
+    )
+    vectors: Tensor = torch.linalg.eigh(matrix)[1]
+    return vectors[:, -1]
+
+
+def _quaternion_product(first: Tensor, second: Tensor) -> Tensor:
+    """Return the quaternions [N, 4] wxyz of a rotation by `second` [N, 4], then by `first` [4]."""
+    w, x, y, z = first.tolist()
+    rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
+    return second @ torch.tensor(rows, dtype=torch.float64).T.to(second)
 
 
 @dataclass

@@ -1,8 +1,7 @@
 """The data types of a scene."""
 
-import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Final, Protocol, Self
@@ -13,127 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from crossgrad_core.contract.blocks import Json
-from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.errors import UserError
-
-
-@dataclass(frozen=True, eq=False)
-class Similarity:
-    """The map x_local = (x_input - offset) * scale, in float64, without a rotation.
-
-    Attributes:
-        offset: [3] float64, input frame.
-        scale: Local units per input unit.
-    """
-
-    offset: NDArray[np.float64]
-    scale: float
-
-    def to_local(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return [N, 3] points of the input frame in the local frame."""
-        return (points - self.offset) * self.scale
-
-    def to_input(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return [N, 3] points of the local frame in the input frame."""
-        return points / self.scale + self.offset
-
-
-#: Coordinates of the scene's files, and coordinates of training.
-INPUT, LOCAL = "input", "local"
-_KNOWN: Final = re.compile(rf"{INPUT}|{LOCAL}|enu|utm|epsg:[0-9]{{4,6}}")
-#: Prefix of the comment in a file whose coordinates differ from the scene's coordinates.
-COORDINATES_TAG = "crossgrad_coordinates:"
-
-
-@dataclass(frozen=True, eq=False)
-class Placed:
-    """Gaussians that are about to be written to a file.
-
-    Attributes:
-        gaussians: Gaussians in a frame that may be rotated against the local frame.
-        similarity: Maps the frame of `gaussians` to the coordinates of the file.
-        facts: Contents of `.georef.json`, for programs that read the file; empty if nothing is
-            known.
-        notes: Messages for the user, one sentence each.
-    """
-
-    gaussians: Gaussians
-    similarity: Similarity
-    facts: Mapping[str, Json] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
-
-
-class Georeference(Protocol):
-    """The location of a scene on Earth, as far as it is known."""
-
-    @property
-    def note(self) -> str:
-        """One sentence with the location and its accuracy, or why the location is not known."""
-        ...
-
-    def placed(self, gaussians: Gaussians, similarity: Similarity, coordinates: str) -> Placed:
-        """Return Gaussians in the requested coordinates.
-
-        Args:
-            gaussians: Gaussians in the local frame, without a graph.
-            similarity: Maps the local frame back to the input frame.
-            coordinates: A name that `check_coordinates` accepts.
-
-        Raises:
-            UserError: The scene cannot be put into these coordinates.
-        """
-        ...
-
-
-@dataclass(frozen=True)
-class Unplaced:
-    """The georeference of a scene whose location is not known.
-
-    Attributes:
-        why: The reason why the location is not known.
-    """
-
-    why: str = "neither the scene files nor the photos contain a position on Earth"
-
-    @property
-    def note(self) -> str:
-        """See `Georeference`."""
-        return f"not georeferenced: {self.why}"
-
-    def placed(self, gaussians: Gaussians, similarity: Similarity, coordinates: str) -> Placed:
-        """Refuse every placement; see `Georeference`."""
-        if coordinates == INPUT:
-            return Placed(gaussians, similarity)
-        if coordinates == LOCAL:
-            return Placed(gaussians, Similarity(np.zeros(3), 1.0), {"coordinates": LOCAL})
-        raise UserError(
-            "the scene cannot be exported in these coordinates: it is not georeferenced",
-            where=f"--coordinates {coordinates}",
-            found=self.why,
-            todo="export in input or local coordinates; docs/coordinates.md explains how to "
-            "georeference a scene",
-        )
-
-
-#: The georeference of a scene without any information on its location.
-UNPLACED: Final = Unplaced()
-
-
-def check_coordinates(name: str) -> None:
-    """Check the name of output coordinates.
-
-    Raises:
-        UserError: A file cannot be written in coordinates of this name.
-    """
-    if not _KNOWN.fullmatch(name):
-        raise UserError(
-            "the coordinate system is unknown",
-            where=f"--coordinates {name}",
-            expected="input, local, enu (metres east, north, up), utm, or epsg:N such as "
-            "epsg:32633",
-            todo="choose one of the listed systems",
-        )
-
+from crossgrad_core.contract.georeference import UNPLACED, Georeference, Similarity
 
 #: Minimum number of cameras for a search for stray cameras.
 _FEWEST: Final = 5
@@ -281,6 +160,10 @@ class View:
     seen: NDArray[np.int64]
 
 
+#: Weight of the cameras' mean up axis, compared with the mean square of their horizontal axes.
+_LEVEL: Final = 1e-3
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """A scene: its views, points and coordinate frames.
@@ -366,6 +249,23 @@ class Scene:
     def middle(self) -> NDArray[np.float64]:
         """[3] mean of the training camera centres without outliers, local frame."""
         return np.asarray(self.robust_centers.mean(axis=0))
+
+    @cached_property
+    def up(self) -> NDArray[np.float64]:
+        """[3] unit vector that points up, local frame, by the georeference or by the cameras.
+
+        People hold cameras level, so that the horizontal axis of a photo is perpendicular to up.
+        The vector is perpendicular to these axes as far as they span a plane. In all other
+        directions it is the mean of the cameras' up axes, tilted back by half of the viewing
+        direction for cameras that look down.
+        """
+        if self.georeference.up is not None:
+            return self.georeference.up
+        poses = np.stack([view.camera.world_to_camera.numpy() for view in self.train_views])
+        right, down, forward = poses[:, :3, :3].transpose(1, 0, 2)
+        level = right.T @ right / len(right) + _LEVEL * np.eye(3)
+        up = np.linalg.solve(level, (-down - 0.5 * forward).mean(axis=0))
+        return np.asarray(up / np.linalg.norm(up))
 
     @cached_property
     def distances(self) -> NDArray[np.float64]:

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
-from crossgrad_core.contract.scene import Camera, Scene, Similarity, View
+from crossgrad_core.contract.georeference import Similarity
+from crossgrad_core.contract.scene import Camera, Scene, View
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.validation import as_user_error
 from crossgrad_core.scene.raw import FARTHEST, FARTHEST_LOCAL

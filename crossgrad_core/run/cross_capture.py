@@ -10,7 +10,8 @@ import torch
 from numpy.typing import NDArray
 
 from crossgrad_core.config import AUTO, ComponentChoice
-from crossgrad_core.contract.scene import Camera, Scene, Similarity, View, centers_of
+from crossgrad_core.contract.georeference import Similarity
+from crossgrad_core.contract.scene import Camera, Scene, View, centers_of
 from crossgrad_core.errors import UserError
 from crossgrad_core.numerics.rotations import rotation_matrices
 from crossgrad_core.run.assemble import accepts, read_scene

@@ -1,7 +1,7 @@
 """Export of the trained scene to a file, and the loss of quality if the file approximates it."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from json import dumps
 from math import fsum
 from pathlib import Path
@@ -11,10 +11,12 @@ from torch import Tensor
 
 from crossgrad_core.contract.blocks import Json
 from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.scene import COORDINATES_TAG, INPUT, Camera, Placed, View
-from crossgrad_core.contract.slots.exporter import Exporter
+from crossgrad_core.contract.georeference import COORDINATES_TAG, INPUT, LOCAL, Placed
+from crossgrad_core.contract.scene import Camera, View
+from crossgrad_core.contract.slots.exporter import ExportContent, Exporter
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import compare, psnr
+from crossgrad_core.run.export_edits import Crop, camera_in, most_important, upright, with_degree
 from crossgrad_core.system.files import write_atomically
 from crossgrad_core.training.per_image_params import apply
 from crossgrad_core.training.rules import eval_parameters
@@ -62,13 +64,43 @@ class Exported:
         return {**values, "loss": self.loss}
 
 
+@dataclass(frozen=True, eq=False)
+class ExportOptions:
+    """The options of an export.
+
+    Attributes:
+        camera: Name of the view for which view-dependent parts are baked; None for the average
+            over the training views.
+        coordinates: Coordinates of the file, as `check_coordinates` accepts them; None for those
+            of the exporter.
+        up: The axis of the file that points up, from `UP_AXES`; None for that of the exporter.
+        sh_degree: Highest degree of spherical harmonics in the file; None for all.
+        crop: The part of space to export; None for all.
+        max_gaussians: Number of Gaussians to keep, those that contribute most to the training
+            photos; None for all.
+        baked: False to store Gaussians with the backbone's own response, for viewers that draw it.
+    """
+
+    camera: str | None = None
+    coordinates: str | None = None
+    up: str | None = None
+    sh_degree: int | None = None
+    crop: Crop | None = None
+    max_gaussians: int | None = None
+    baked: bool = True
+
+    @property
+    def reduces(self) -> bool:
+        """True if the file has fewer Gaussians or fewer coefficients than the model."""
+        return any(v is not None for v in (self.sh_degree, self.crop, self.max_gaussians))
+
+
 def export_scene(
     setup: Setup,
     state: TrainState,
     path: Path,
-    camera: str | None = None,
     exporter: Exporter | None = None,
-    coordinates: str = INPUT,
+    options: ExportOptions = ExportOptions(),
 ) -> Exported:
     """Write the trained scene and, if there is anything to record, a `.georef.json`.
 
@@ -76,35 +108,66 @@ def export_scene(
         setup: The run.
         state: The state of the run.
         path: The file.
-        camera: Name of the view for which view-dependent parts are baked; None for the average
-            over the training views.
         exporter: The exporter; by default the exporter of the run.
-        coordinates: Coordinates of the file, as `check_coordinates` accepts them.
+        options: The options of the export.
 
     Raises:
-        UserError: There is no view of that name, the scene cannot be put into these coordinates, or
-            the file cannot be written.
+        UserError: There is no view of that name, no Gaussian is left, the scene cannot be put into
+            these coordinates, or the file cannot be written.
     """
-    phase = setup.phase(state.step, training=False)
-    view = None if camera is None else view_named(setup, camera)
+    exporter, scene = exporter or setup.selection.exporter, setup.scene
+    view = None if options.camera is None else view_named(setup, options.camera)
     views = setup.train_views if view is None else (view,)
-    with torch.no_grad():
-        cameras = [baked_view.camera for baked_view in views]
-        baked = setup.backbone.bake(eval_parameters(setup, state), phase, cameras)
-    exporter = exporter or setup.selection.exporter
-    placed = setup.scene.georeference.placed(baked, setup.scene.similarity, coordinates)
+    coordinates, axis = coordinates_of(setup, exporter, options)
+    baked = with_degree(_gaussians_of(setup, state, exporter, views, options), options.sh_degree)
+    placed = scene.georeference.placed(baked, scene.similarity, coordinates)
+    placed = upright(placed, scene.up, axis, coordinates)
+    rows = torch.ones(len(baked), dtype=torch.bool)
+    if options.crop is not None:
+        means = placed.gaussians.means.detach().cpu().double().numpy()
+        rows = torch.from_numpy(options.crop.inside(placed.similarity.to_input(means), axis))
+    if options.max_gaussians is not None and int(rows.sum()) > options.max_gaussians:
+        kept = most_important(setup, baked.selected(rows), setup.train_views, options.max_gaussians)
+        rows[rows.clone()] = kept
+    if options.reduces:
+        baked = baked.selected(rows)
+        placed = replace(placed, gaussians=placed.gaussians.selected(rows))
+    if not len(baked):
+        raise UserError(
+            "no Gaussian is left to export",
+            where=path,
+            found="no Gaussian of the model is inside the part of --crop"
+            if options.crop is not None
+            else "a model without Gaussians",
+            todo="give --crop in the coordinates of the exported file"
+            if options.crop is not None
+            else "train the run with more steps or with another densifier",
+        )
+    frame = coordinates if axis == INPUT else f"{coordinates}, {axis} up"
     comments = [f"crossgrad step {state.step}"]
-    comments += [] if coordinates == INPUT else [f"{COORDINATES_TAG} {coordinates}"]
-    notes = exporter.write(placed.gaussians, placed.similarity, path, comments)
+    comments += [] if frame == INPUT else [f"{COORDINATES_TAG} {frame}"]
+    content = ExportContent(
+        placed.gaussians,
+        placed.similarity,
+        tuple(
+            replace(each, camera=camera_in(each.camera, placed.rotation))
+            for each in setup.train_views
+        ),
+        placed.rotation @ scene.up,
+        placed.to_ecef,
+        tuple(comments),
+    )
+    notes = exporter.write(content, path)
     notes += (*placed.notes, *_write_georef(path, placed, exporter))
+    bakes = options.baked and not setup.backbone.plain
     plain, background = setup.backbone.plain, _own_background(setup)
-    if plain and background is None:
+    if plain and background is None and not exporter.lossy and not options.reduces:
         return Exported(len(baked), notes=notes)
-    compared = setup.scene.test_views if view is None else (view,)
-    drawn = drawer(setup, state, exporter.stored(baked))
+    compared = scene.test_views if view is None else (view,)
+    drawn = drawer(setup, state, exporter.stored(baked, scene.similarity))
     return Exported(
         gaussians=len(baked),
-        baked_for=None if plain else camera or f"{len(views)} training views",
+        baked_for=options.camera or f"{len(views)} training views" if bakes else None,
         views=len(compared),
         psnr=_mean_psnr(compared, drawn),
         live_psnr=_mean_psnr(compared, renderer(setup, state)),
@@ -113,9 +176,56 @@ def export_scene(
     )
 
 
+def _gaussians_of(
+    setup: Setup,
+    state: TrainState,
+    exporter: Exporter,
+    views: Sequence[View],
+    options: ExportOptions,
+) -> Gaussians:
+    """Return the model's Gaussians in the local frame, baked for the views if that is asked for."""
+    phase, parameters = setup.phase(state.step, training=False), eval_parameters(setup, state)
+    with torch.no_grad():
+        if options.baked:
+            return setup.backbone.bake(parameters, phase, [view.camera for view in views])
+        unbaked = setup.backbone.unbaked(parameters, phase)
+    if unbaked is not None and unbaked.response not in exporter.responses:
+        raise UserError(
+            f"the format cannot store Gaussians with the response {unbaked.response}",
+            where="--unbaked",
+            expected="a format with a field for the response, such as ply or spz",
+            todo="leave --unbaked out, or choose another --format",
+        )
+    if unbaked is None:
+        raise UserError(
+            f"--unbaked has no effect: backbone {setup.selection.names['backbone']} has no "
+            "response of its own that a file can store",
+            where="--unbaked",
+            expected="a backbone with its own response, such as mip",
+            todo="leave --unbaked out",
+        )
+    return unbaked
+
+
+def coordinates_of(setup: Setup, exporter: Exporter, options: ExportOptions) -> tuple[str, str]:
+    """Return the coordinates of a file and the axis that points up in it.
+
+    The exporter's defaults apply where the options say nothing. Map axes are never rotated, and a
+    scene without a location keeps its input coordinates.
+    """
+    coordinates = options.coordinates
+    if coordinates is None:
+        placeable = setup.scene.georeference.up is not None
+        coordinates = exporter.coordinates if placeable else INPUT
+    axis = options.up
+    if axis is None:
+        axis = exporter.up if coordinates in {INPUT, LOCAL, "enu"} else INPUT
+    return coordinates, axis
+
+
 def georef_of(path: Path) -> Path:
     """Return the path of the file that tells other programs the location of an exported file."""
-    return path.with_suffix(".georef.json")
+    return path.with_name(f"{path.name}.georef.json")
 
 
 def _write_georef(path: Path, placed: Placed, exporter: Exporter) -> tuple[str, ...]:

@@ -144,16 +144,15 @@ class Run:
                 georeferenced, or the run has no checkpoint.
         """
         from crossgrad_core.run.app import as_in_a_command
+        from crossgrad_core.run.export import ExportOptions
         from crossgrad_core.run.postprocess.export import exported
 
         with as_in_a_command():
             out = Path(path)
             exported(
                 self.folder,
-                file_format=None,
                 out=out,
-                camera=camera,
-                coordinates=coordinates,
+                options=ExportOptions(camera=camera, coordinates=coordinates),
                 how=self._opened,
             )
             return out

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.contract.scene import Similarity, stray_rows
+from crossgrad_core.contract.georeference import Similarity
+from crossgrad_core.contract.scene import stray_rows
 
 # The scene extent is this factor times the largest distance between a training camera and the mean
 # of all training cameras (3DGS).

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 
 from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.scene import Similarity
-from crossgrad_core.contract.slots.exporter import Exporter
+from crossgrad_core.contract.georeference import Similarity
+from crossgrad_core.contract.slots.exporter import ExportContent, Exporter
 from crossgrad_core.testing.fixtures import sample_gaussians
 from crossgrad_core.testing.support.components import COMPONENT_CHECKS
 from crossgrad_core.testing.support.contract import Check, Make, cannot_tell, require
@@ -31,7 +31,9 @@ def writes_one_file(make: Make[Exporter]) -> None:
         first, second = (Path(folder) / name for name in ("a", "b"))
         for path in (first, second):
             given = _gaussians()
-            notes: object = make().write(given, _FRAME, path, ("a comment",))
+            notes: object = make().write(
+                ExportContent(given, _FRAME, comments=("a comment",)), path
+            )
             _require_kept(given, "write")
             good = isinstance(notes, tuple) and all(isinstance(note, str) for note in notes)
             require(good, f"write() returns {notes!r}, not a tuple of strings")
@@ -48,11 +50,11 @@ def appears_at_once(make: Make[Exporter]) -> None:
     """An existing file is replaced as a whole and is never overwritten in place."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "a"
-        make().write(_gaussians(), _FRAME, path, ())
+        make().write(ExportContent(_gaussians(), _FRAME), path)
         before = path.stat().st_ino
         if not before:
             raise cannot_tell("this file system has no inode numbers")
-        make().write(_gaussians(), _FRAME, path, ())
+        make().write(ExportContent(_gaussians(), _FRAME), path)
         require(
             path.stat().st_ino != before,
             "write() overwrites the file in place, so a reader or a full disk can leave "
@@ -68,10 +70,10 @@ def writes_the_input_frame(make: Make[Exporter]) -> None:
     scale = Similarity(_FRAME.offset, 4.0 * _FRAME.scale)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "a"
-        exporter.write(given, _FRAME, path, ())
+        exporter.write(ExportContent(given, _FRAME), path)
         written, rounding = path.read_bytes(), exporter.rounding(given, _FRAME)
         for similarity, what in ((offset, "offset"), (scale, "scale")):
-            exporter.write(given, similarity, path, ())
+            exporter.write(ExportContent(given, similarity), path)
             moved = not np.array_equal(exporter.rounding(given, similarity).offset, rounding.offset)
             require(
                 path.read_bytes() != written or moved,
@@ -88,9 +90,9 @@ def what_it_writes_is_read_again(make: Make[Exporter]) -> None:
         raise cannot_tell("crossgrad writes files of this format but does not read them")
     with TemporaryDirectory() as folder:
         path = Path(folder) / f"a.{exporter.suffix}"
-        exporter.write(_gaussians(), _FRAME, path, ())
+        exporter.write(ExportContent(_gaussians(), _FRAME), path)
         read_back = exporter.read(path, _FRAME)
-    stored = exporter.stored(_gaussians())
+    stored = exporter.stored(_gaussians(), _FRAME)
     require(
         len(read_back) == len(stored),
         f"{len(stored)} Gaussians were written, but {len(read_back)} were read",
@@ -109,7 +111,7 @@ def what_it_writes_is_read_again(make: Make[Exporter]) -> None:
 def the_stored_ones_can_be_drawn(make: Make[Exporter]) -> None:
     """`stored` returns as many finite Gaussians as it got, and does not change its input."""
     given = _gaussians()
-    stored = make().stored(given)
+    stored = make().stored(given, _FRAME)
     require(isinstance(stored, Gaussians), f"stored() returns {stored!r}, not Gaussians")
     require(len(stored) == len(given), f"{len(given)} Gaussians became {len(stored)}")
     for name in ("means", "quats", "scales", "opacities"):

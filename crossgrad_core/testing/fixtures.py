@@ -13,7 +13,8 @@ from torch import Tensor
 from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.contract.contexts import SampleContext, StepRecord, ViewSample
 from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.scene import Camera, Scene, Similarity, View
+from crossgrad_core.contract.georeference import Similarity
+from crossgrad_core.contract.scene import Camera, Scene, View
 from crossgrad_core.contract.schedule import Phase, Schedule
 from crossgrad_core.contract.slots.sampler import Sampler
 

@@ -14,7 +14,7 @@ from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
 from crossgrad_core.run import app
 from crossgrad_core.run.assemble import assemble, read_scene
-from crossgrad_core.run.export import export_scene
+from crossgrad_core.run.export import ExportOptions, export_scene
 from crossgrad_core.run.postprocess import evaluate, export
 from crossgrad_core.run.postprocess.open_options import AS_IT_IS
 from crossgrad_core.training.start import first_state
@@ -54,7 +54,7 @@ def sfm_points(setup):
 
 def file_of(path):
     """[N, 3] positions of a PLY with its offset, and what stands beside it."""
-    beside = json.loads(path.with_suffix(".georef.json").read_text())
+    beside = json.loads(path.with_name(f"{path.name}.georef.json").read_text())
     assert beside["file"] == path.name
     return plyread(path).means.astype(np.float64) + beside["offset"], beside
 
@@ -70,7 +70,7 @@ def test_an_exported_file_is_georeferenced_and_its_matrices_invert_the_export(
 ):
     setup, state = started(scene)
     path = tmp_path / "a.ply"
-    exported = export_scene(setup, state, path, coordinates=coordinates)
+    exported = export_scene(setup, state, path, options=ExportOptions(coordinates=coordinates))
     positions, beside = file_of(path)
     points = sfm_points(setup)
     enu = TO_ENU.points(points)
@@ -148,13 +148,13 @@ def test_a_run_writes_a_georeference_file_next_to_its_ply(trained):
 def test_a_scene_without_georeference_or_offset_writes_no_georef_file(tmp_path):
     setup, state = started(write_tiny_scene(tmp_path / "scene", views=4, width=24, height=16))
     export_scene(setup, state, tmp_path / "a.ply")
-    assert not (tmp_path / "a.georef.json").exists()
-    export_scene(setup, state, tmp_path / "b.ply", coordinates="local")
+    assert not (tmp_path / "a.ply.georef.json").exists()
+    export_scene(setup, state, tmp_path / "b.ply", options=ExportOptions(coordinates="local"))
     positions, beside = file_of(tmp_path / "b.ply")
     assert beside == {"file": "b.ply", "coordinates": "local", "offset": [0.0] * 3, "rounding": 0.0}
     np.testing.assert_allclose(positions, setup.scene.points, atol=1e-7)
     with pytest.raises(UserError, match="not georeferenced") as caught:
-        export_scene(setup, state, tmp_path / "c.ply", coordinates="enu")
+        export_scene(setup, state, tmp_path / "c.ply", options=ExportOptions(coordinates="enu"))
     assert "neither the scene files nor the photos" in caught.value.found
     assert not (tmp_path / "c.ply").exists()
 
@@ -164,26 +164,26 @@ def test_export_writes_next_to_the_files_of_the_run_and_overwrites_none(trained,
     before.pop("SHA256SUMS", None)  # It follows each file that is added.
     assert ended("export", trained, "--coordinates", "utm") == 0
     told = capsys.readouterr().out
-    assert "utm coordinates, see point_cloud_utm.georef.json" in told
+    assert "utm coordinates, see point_cloud_utm.ply.georef.json" in told
     new = {path.name for path in trained.iterdir()} - before.keys()
-    assert {"point_cloud_utm.ply", "point_cloud_utm.georef.json"} <= new
+    assert {"point_cloud_utm.ply", "point_cloud_utm.ply.georef.json"} <= new
     assert {name: (trained / name).read_bytes() for name in before} == before
     with pytest.raises(UserError, match="the output file already exists"):
-        export.exported(trained, file_format=None, out=None, coordinates="utm")
+        export.exported(trained, out=None, options=ExportOptions(coordinates="utm"))
     with pytest.raises(UserError, match=r"coordinate system is unknown(?s:.*)epsg:32633"):
-        export.exported(trained, file_format=None, out=None, coordinates="gauss")
+        export.exported(trained, out=None, options=ExportOptions(coordinates="gauss"))
 
 
 def test_an_existing_georef_file_next_to_a_named_output_is_not_replaced(trained, tmp_path):
-    (tmp_path / "a.georef.json").write_text("mine")
+    (tmp_path / "a.ply.georef.json").write_text("mine")
     with pytest.raises(UserError, match="the output file already exists"):
-        export.exported(trained, file_format=None, out=tmp_path / "a.ply", coordinates="enu")
-    assert (tmp_path / "a.georef.json").read_text() == "mine"
+        export.exported(trained, out=tmp_path / "a.ply", options=ExportOptions(coordinates="enu"))
+    assert (tmp_path / "a.ply.georef.json").read_text() == "mine"
 
 
 def test_evaluating_a_ply_in_other_coordinates_is_refused(trained, tmp_path):
     path = tmp_path / "a.ply"
-    export.exported(trained, file_format=None, out=path, coordinates="enu")
+    export.exported(trained, out=path, options=ExportOptions(coordinates="enu"))
     with pytest.raises(UserError, match=r"uses other coordinates(?s:.*)--coordinates input"):
         evaluate.evaluated_file(trained, path)
 

@@ -9,7 +9,7 @@ from gsply import plyread
 from gsply.formats import EXPECTED_PROPERTIES_BY_SH_DEGREE
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.contract.scene import Similarity
+from crossgrad_core.contract.georeference import Similarity
 from crossgrad_core.registry.entries import offers
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.export import export_scene

@@ -18,7 +18,8 @@ import numpy as np
 import torch
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.contract.scene import Camera, Scene, Similarity, View
+from crossgrad_core.contract.georeference import Similarity
+from crossgrad_core.contract.scene import Camera, Scene, View
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import entries
 from crossgrad_core.run.assemble import assemble

@@ -132,6 +132,13 @@ class Backbone(Component):
         limit = torch.logit(torch.tensor(cap, dtype=torch.float64)).item()
         return parameters["opacities"].detach().clamp(max=limit)
 
+    def unbaked(self, parameters: Mapping[str, Tensor], phase: Phase) -> Gaussians | None:
+        """Return view-independent Gaussians with the backbone's own response, without a graph.
+
+        By default None: the backbone draws with the plain response, or depends on the view.
+        """
+        return None
+
     @abstractmethod
     def bake(
         self, parameters: Mapping[str, Tensor], phase: Phase, cameras: Sequence[Camera]

@@ -1,7 +1,6 @@
 """The exporter slot: a component writes the trained Gaussians to a file for other programs."""
 
 from abc import abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -10,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.contract.component import Component
-from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.scene import Similarity
+from crossgrad_core.contract.gaussians import Gaussians, Response
+from crossgrad_core.contract.georeference import INPUT, Similarity
+from crossgrad_core.contract.scene import View
 from crossgrad_core.errors import UserError
 
 
@@ -29,27 +29,55 @@ class Rounding:
     largest: float | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class ExportContent:
+    """The content of a file that an exporter writes.
+
+    Attributes:
+        gaussians: View-independent Gaussians without a graph, at least one. Their frame is the
+            local frame, or is rotated against it.
+        similarity: Maps the frame of `gaussians` to the coordinates of the file.
+        views: The training views, with cameras in the frame of `gaussians`.
+        up: [3] float64 unit vector that points up in the frame of `gaussians`; None if unknown.
+        to_ecef: [4, 4] float64, maps coordinates of the file to ECEF metres on the WGS 84
+            ellipsoid; None if the location is not known.
+        comments: Lines of plain text about the file, for formats that can hold them.
+    """
+
+    gaussians: Gaussians
+    similarity: Similarity
+    views: tuple[View, ...] = ()
+    up: NDArray[np.float64] | None = None
+    to_ecef: NDArray[np.float64] | None = None
+    comments: tuple[str, ...] = ()
+
+
 class Exporter(Component):
     """A writer of Gaussians to files of one format.
 
     Attributes:
-        suffix: Suffix of the exporter's files, without the dot.
+        suffix: Suffix of the exporter's files, without the dot; empty for a folder of files.
+        up: The axis that points up in the format's coordinates: `y`, `z`, or `input` if the format
+            keeps the axes of the input. It is the default of `--up`.
+        coordinates: The default of `--coordinates`, if the scene can be exported in them.
+        lossy: True if the file approximates the Gaussians; then the loss in dB is measured.
+        responses: The responses of Gaussians that the format can store.
     """
 
     slot: ClassVar[str] = "exporters"
     suffix: ClassVar[str]
+    up: ClassVar[str] = INPUT
+    coordinates: ClassVar[str] = INPUT
+    lossy: ClassVar[bool] = False
+    responses: ClassVar[frozenset[Response]] = frozenset({"plain"})
 
     @abstractmethod
-    def write(
-        self, gaussians: Gaussians, similarity: Similarity, path: Path, comments: Sequence[str]
-    ) -> tuple[str, ...]:
+    def write(self, content: ExportContent, path: Path) -> tuple[str, ...]:
         """Write the file; either the complete file appears or no file.
 
         Args:
-            gaussians: View-independent Gaussians in the local frame, without a graph.
-            similarity: Maps the local frame back to the input frame, in which files are written.
-            path: The file.
-            comments: Lines of plain text about the file, for formats that can hold them.
+            content: The Gaussians, and the facts about their scene.
+            path: The file. If `suffix` is empty, it is the folder, which does not exist yet.
 
         Returns:
             Messages for the user about the file, one sentence each; usually none.
@@ -62,9 +90,16 @@ class Exporter(Component):
         """Return offset and rounding error of positions in the file that `write` creates."""
         return Rounding(np.zeros(3))
 
-    def stored(self, gaussians: Gaussians) -> Gaussians:
-        """Return the Gaussians that the file stores, in the local frame; by default unchanged."""
+    def stored(self, gaussians: Gaussians, similarity: Similarity) -> Gaussians:
+        """Return the Gaussians that `write` stores for `gaussians`, in their frame and order.
+
+        By default they are unchanged.
+        """
         return gaussians
+
+    def is_of_format(self, path: Path) -> bool:
+        """Return True if the name of a file shows that it has this format."""
+        return bool(self.suffix) and path.name.lower().endswith(f".{self.suffix}")
 
     def read(self, path: Path, similarity: Similarity) -> Gaussians:
         """Return the Gaussians in a file, to start a run from; by default raise an error.

@@ -3,11 +3,11 @@
 from pathlib import Path
 from typing import Final
 
-from crossgrad_core.contract.scene import INPUT, check_coordinates
+from crossgrad_core.contract.georeference import INPUT, check_coordinates
 from crossgrad_core.contract.slots.exporter import Exporter
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, find
-from crossgrad_core.run.export import Exported, described, export_scene, georef_of
+from crossgrad_core.run.export import Exported, ExportOptions, described, export_scene, georef_of
 from crossgrad_core.run.postprocess.open_options import AS_IT_IS, Opens
 from crossgrad_core.run.postprocess.output_paths import own_name, writing
 from crossgrad_core.run.results.panels import flat_names
@@ -19,22 +19,21 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.wording import one_line
 
 #: Suffixes of Gaussian file formats. A file must not have the suffix of another format.
-_OF_FORMATS: Final = frozenset({".ply", ".splat", ".ksplat", ".spz", ".sog", ".rad", ".usdz"})
+_OF_FORMATS: Final = frozenset(
+    {".ply", ".splat", ".ksplat", ".spz", ".sog", ".rad", ".glb", ".html", ".usdz"}
+)
 
 
 def export(
     folder: Path,
     *,
-    file_format: str | None,
-    out: Path | None,
-    camera: str | None = None,
-    coordinates: str = INPUT,
+    file_format: str | None = None,
+    out: Path | None = None,
+    options: ExportOptions = ExportOptions(),  # noqa: B008 - it is frozen
     how: Opens = AS_IT_IS,
 ) -> None:
     """Write the trained scene like `exported`, and print a description of the file."""
-    path, content = exported(
-        folder, file_format=file_format, out=out, camera=camera, coordinates=coordinates, how=how
-    )
+    path, content = exported(folder, file_format=file_format, out=out, options=options, how=how)
     for line in described(content, path):
         print(line)  # noqa: T201
     print(f"{content.gaussians:,} Gaussians written to {one_line(path)}")  # noqa: T201
@@ -43,10 +42,9 @@ def export(
 def exported(
     folder: Path,
     *,
-    file_format: str | None,
-    out: Path | None,
-    camera: str | None = None,
-    coordinates: str = INPUT,
+    file_format: str | None = None,
+    out: Path | None = None,
+    options: ExportOptions = ExportOptions(),  # noqa: B008 - it is frozen
     how: Opens = AS_IT_IS,
 ) -> tuple[Path, Exported]:
     """Write the trained scene to a file that viewers open.
@@ -56,8 +54,7 @@ def exported(
         file_format: Name of an exporter; None for the exporter of the run.
         out: The file; by default a file in the run's folder. The default name is never the name of
             a file that summary.json describes with another content.
-        camera: Name of the view to bake for; by default the average over the training views.
-        coordinates: Coordinates of the file, as `check_coordinates` accepts them.
+        options: The options of the export.
         how: The options for opening the run.
 
     Returns:
@@ -68,7 +65,8 @@ def exported(
             file exists, there is no such view or nothing to bake for it, the scene cannot be put
             into these coordinates, or the run is training and `out` is not given.
     """
-    check_coordinates(coordinates)
+    if options.coordinates is not None:
+        check_coordinates(options.coordinates)
     if file_format is not None:
         find("exporters", file_format)
     with writing(folder, out, "exporting"):
@@ -81,13 +79,8 @@ def exported(
         exporter = setup.selection.exporter
         if file_format not in {None, setup.selection.names["exporter"]}:
             exporter = build(Exporter, str(file_format), {})
-        if out is not None and out.suffix.lower() in _OF_FORMATS - {f".{exporter.suffix}"}:
-            raise UserError(
-                "the name of the output file ends like a file of another format",
-                where=f"--out {out}",
-                expected=f"a name that ends in .{exporter.suffix}",
-                todo="rename it, or choose another --format (`crossgrad plugins list` shows them)",
-            )
+        _check_name(out, exporter)
+        camera = options.camera
         if camera is not None and setup.backbone.plain:
             raise UserError(
                 f"--camera has no effect: backbone {setup.selection.names['backbone']} "
@@ -95,16 +88,45 @@ def exported(
                 where="--camera",
                 todo="leave --camera out",
             )
-        words = [CLOUD] if camera is None else [CLOUD, _flat(setup, camera)]
-        words += [] if coordinates == INPUT else [coordinates.replace(":", "-")]
-        name = f"{'_'.join(words)}.{exporter.suffix}"
-        if words == [CLOUD]:
+        words = [CLOUD, *_differences(setup, options)]
+        kind = f".{exporter.suffix}" if exporter.suffix else f"_{file_format}"
+        name = f"{'_'.join(words)}{kind}"
+        if words == [CLOUD] and exporter.suffix:
             path = out or folder / own_name(folder, name, state.step)
         else:
             path = out or folder / name
             check_new(path)
         with relisted(folder, *(() if out else (path.name, georef_of(path).name))):
-            return path, export_scene(setup, state, path, camera, exporter, coordinates)
+            return path, export_scene(setup, state, path, exporter, options)
+
+
+def _check_name(out: Path | None, exporter: Exporter) -> None:
+    """Refuse an output file whose name ends like a file of another format."""
+    if out is None or out.suffix.lower() not in _OF_FORMATS - {f".{exporter.suffix}"}:
+        return
+    raise UserError(
+        "the name of the output file ends like a file of another format",
+        where=f"--out {out}",
+        expected=f"a name that ends in .{exporter.suffix}"
+        if exporter.suffix
+        else "the name of a new folder",
+        todo="rename it, or choose another --format (`crossgrad plugins list` shows them)",
+    )
+
+
+def _differences(setup: Setup, options: ExportOptions) -> list[str]:
+    """Return the parts of a file name that tell an export from the export with defaults."""
+    words = {
+        "camera": options.camera and _flat(setup, options.camera),
+        "coordinates": options.coordinates not in {None, INPUT}
+        and str(options.coordinates).replace(":", "-"),
+        "up": options.up and f"{options.up}-up",
+        "degree": options.sh_degree is not None and f"sh{options.sh_degree}",
+        "crop": options.crop and "crop",
+        "number": options.max_gaussians and f"{options.max_gaussians}",
+        "response": not options.baked and "unbaked",
+    }
+    return [word for word in words.values() if word]
 
 
 def _flat(setup: Setup, camera: str) -> str:

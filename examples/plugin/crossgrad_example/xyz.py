@@ -1,12 +1,11 @@
 """An exporter of centres as lines of text."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar
 
 from typing_extensions import override
 
-from crossgrad_core.plugin import Exporter, Gaussians, Similarity
+from crossgrad_core.plugin import ExportContent, Exporter
 
 
 class Xyz(Exporter):
@@ -15,10 +14,8 @@ class Xyz(Exporter):
     suffix: ClassVar[str] = "xyz"
 
     @override
-    def write(
-        self, gaussians: Gaussians, similarity: Similarity, path: Path, comments: Sequence[str]
-    ) -> tuple[str, ...]:
-        centres = similarity.to_input(gaussians.means.detach().cpu().double().numpy())
+    def write(self, content: ExportContent, path: Path) -> tuple[str, ...]:
+        centres = content.similarity.to_input(content.gaussians.means.double().numpy())
         part = path.with_name(f".{path.name}.part")
         part.write_text("".join(f"{x} {y} {z}\n" for x, y, z in centres), encoding="utf-8")
         part.replace(path)

@@ -1,12 +1,11 @@
 """The PLY file of 3DGS, which all viewers of Gaussians can open."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar
 
 from typing_extensions import override
 
-from crossgrad_core.plugin import Exporter, Gaussians, Rounding, Similarity
+from crossgrad_core.plugin import ExportContent, Exporter, Gaussians, Response, Rounding, Similarity
 from crossgrad_plugins.exporters.ply_cloud import SplatCloud
 from crossgrad_plugins.exporters.ply_file import (
     position_rounding,
@@ -20,19 +19,19 @@ class Ply(Exporter):
     """The standard PLY of 3DGS: spherical harmonics, log scales, logits of opacities."""
 
     suffix: ClassVar[str] = "ply"
+    responses: ClassVar[frozenset[Response]] = frozenset({"plain", "antialiased"})
 
     @override
-    def write(
-        self, gaussians: Gaussians, similarity: Similarity, path: Path, comments: Sequence[str]
-    ) -> tuple[str, ...]:
-        return write_ply(path, SplatCloud.from_gaussians(gaussians), similarity, comments)
+    def write(self, content: ExportContent, path: Path) -> tuple[str, ...]:
+        cloud = SplatCloud.from_gaussians(content.gaussians)
+        return write_ply(path, cloud, content.similarity, content.comments)
 
     @override
     def rounding(self, gaussians: Gaussians, similarity: Similarity) -> Rounding:
         return position_rounding(SplatCloud.from_gaussians(gaussians), similarity)
 
     @override
-    def stored(self, gaussians: Gaussians) -> Gaussians:
+    def stored(self, gaussians: Gaussians, similarity: Similarity) -> Gaussians:
         return SplatCloud.from_gaussians(gaussians).to_gaussians()
 
     @override

@@ -2,70 +2,16 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache
 from typing import Final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
-from torch import Tensor
 
-from crossgrad_core.numerics.raster_constants import COEFFICIENTS
 from crossgrad_core.plugin import INPUT, LOCAL, Gaussians, Json, Placed, Similarity
 from crossgrad_plugins.georeference.ellipsoid import Place
 from crossgrad_plugins.georeference.frames import SAME, Frame3D
 from crossgrad_plugins.georeference.projection import Projection, utm_code
-from crossgrad_plugins.rasterizers.reference.harmonics import harmonics
-
-#: Number of directions in which the spherical harmonics of a rotated frame are compared. It is more
-#: than twice the number of harmonics.
-_DIRECTIONS = 48
-
-
-def turned(gaussians: Gaussians, means: Tensor, rotation: Tensor) -> Gaussians:
-    """Return Gaussians with new centres [N, 3]; all are rotated by one rotation [3, 3] float64.
-
-    A camera that is moved in the same way sees the same image.
-    """
-    x, y, z, w = Rotation.from_matrix(rotation.cpu().numpy()).as_quat().tolist()
-    quats = _product((w, x, y, z), gaussians.quats)
-    rest = gaussians.sh_rest
-    if rest is not None:
-        degree = COEFFICIENTS.index(1 + rest.shape[1])
-        rest = _harmonics_turn(rotation, degree).to(rest) @ rest
-    return replace(gaussians, means=means, quats=quats, sh_rest=rest)
-
-
-def _product(first: tuple[float, ...], second: Tensor) -> Tensor:
-    """Return the quaternions [N, 4] wxyz of a rotation by `second` [N, 4], then by `first`."""
-    w, x, y, z = first
-    rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
-    return second @ torch.tensor(rows, dtype=torch.float64).T.to(second)
-
-
-def _harmonics_turn(rotation: Tensor, degree: int) -> Tensor:
-    """Return the matrix [B, B], float64, that rotates coefficients of bands 1 to `degree`.
-
-    The harmonics of a rotated direction are linear in the harmonics of the direction, with an
-    orthogonal matrix for each band. The matrix is fitted to the values of the harmonics in enough
-    directions.
-    """
-    directions = _directions()
-    before, after = (
-        harmonics(vectors, degree)[:, 1:] for vectors in (directions, directions @ rotation)
-    )
-    matrix: Tensor = torch.linalg.lstsq(before, after).solution
-    return matrix
-
-
-@cache
-def _directions() -> Tensor:
-    """Return unit vectors [48, 3], float64, in all directions."""
-    drawn = torch.randn((_DIRECTIONS, 3), generator=torch.Generator().manual_seed(0)).double()
-    unit: Tensor = drawn / drawn.norm(dim=1, keepdim=True)
-    return unit
-
 
 #: Statistics of the distances between photos and their GPS positions in metres: in 3-D, along the
 #: ground, and vertically.
@@ -108,6 +54,11 @@ class OnEarth:
             f"{self.to_enu.scale:.6g} m{residual_text}"
         )
 
+    @property
+    def up(self) -> NDArray[np.float64]:
+        """[3] unit vector: up at the origin, in the frame of the input files."""
+        return np.asarray(self.to_enu.rotation[2])
+
     def placed(self, gaussians: Gaussians, similarity: Similarity, coordinates: str) -> Placed:
         """See `crossgrad_core.plugin.Georeference`."""
         facts = {**self._facts(), "coordinates": coordinates}
@@ -117,10 +68,17 @@ class OnEarth:
             facts["transform_error_m"] = _apart(self.to_enu.points(centers), here)
         if coordinates == INPUT:
             facts |= self.system.facts if self.system is not None else {}
-            return Placed(gaussians, similarity, {**facts, **self._ways(SAME)})
+            return Placed(
+                gaussians, similarity, {**facts, **self._ways(SAME)}, to_ecef=self._to_ecef(SAME)
+            )
         if coordinates == LOCAL:
             local = Frame3D(np.eye(3), -similarity.scale * similarity.offset, similarity.scale)
-            return Placed(gaussians, Similarity(np.zeros(3), 1.0), {**facts, **self._ways(local)})
+            return Placed(
+                gaussians,
+                Similarity(np.zeros(3), 1.0),
+                {**facts, **self._ways(local)},
+                to_ecef=self._to_ecef(local),
+            )
         if coordinates == "enu":
             return self._turned(gaussians, similarity, self.to_enu, here, facts)
         where, code = f"--coordinates {coordinates}", coordinates
@@ -156,8 +114,17 @@ class OnEarth:
         offset = frame.points(similarity.offset[None])[0]
         frame_similarity = Similarity(offset, similarity.scale / frame.scale)
         means = torch.from_numpy(frame_similarity.to_local(points)).to(gaussians.means.device)
-        moved = turned(gaussians, means, torch.from_numpy(frame.rotation))
-        return Placed(moved, frame_similarity, {**facts, **self._ways(frame)})
+        return Placed(
+            gaussians.rotated(torch.from_numpy(frame.rotation), means),
+            frame_similarity,
+            {**facts, **self._ways(frame)},
+            rotation=frame.rotation,
+            to_ecef=self._to_ecef(frame),
+        )
+
+    def _to_ecef(self, frame: Frame3D) -> NDArray[np.float64]:
+        """Return the map [4, 4] to ECEF metres from coordinates to which `frame` maps the input."""
+        return self.origin.to_enu.inverse.after(self.to_enu).after(frame.inverse).matrix
 
     def _facts(self) -> dict[str, Json]:
         """Return the facts that hold in any coordinates."""

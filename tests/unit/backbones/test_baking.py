@@ -12,7 +12,7 @@ from crossgrad_backbones.baking import as_plain
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.run.assemble import assemble, read_scene
-from crossgrad_core.run.export import export_scene
+from crossgrad_core.run.export import ExportOptions, export_scene
 from crossgrad_core.testing.fixtures import sample_gaussians, sample_scene
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
@@ -122,6 +122,8 @@ def test_a_trained_scene_loses_little_quality_at_the_camera_it_is_baked_for(
     for _ in range(60):
         timed_step(setup, state)
     for view in (setup.train_views[0], setup.scene.test_views[0]):
-        exported = export_scene(setup, state, tmp_path / "baked.ply", view.name)
+        exported = export_scene(
+            setup, state, tmp_path / "baked.ply", options=ExportOptions(view.name)
+        )
         assert exported.live_psnr > 14.0
         assert abs(exported.loss) <= most

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.scene import Similarity
+from crossgrad_core.contract.georeference import Similarity
 from crossgrad_core.errors import UserError
 from crossgrad_plugins.exporters.ply_cloud import SplatCloud
 from crossgrad_plugins.exporters.ply_file import (

@@ -12,7 +12,7 @@ from pyproj.database import query_utm_crs_info
 from scipy.spatial.transform import Rotation
 from support.gaussians import posed_camera, random_gaussians
 
-from crossgrad_core.contract.scene import Similarity
+from crossgrad_core.contract.georeference import Similarity
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_plugins.exporters.ply_cloud import SplatCloud

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from crossgrad_core.contract.scene import Similarity, radial_distances
+from crossgrad_core.contract.georeference import Similarity
+from crossgrad_core.contract.scene import radial_distances
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.testing.fixtures import posed_scene, posed_view

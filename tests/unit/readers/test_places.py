@@ -24,7 +24,7 @@ from support.places import (
 )
 from support.scenes import write_tiny_scene
 
-from crossgrad_core.contract.scene import UNPLACED, Unplaced
+from crossgrad_core.contract.georeference import UNPLACED, Unplaced
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build

@@ -8,7 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
-from crossgrad_core.contract.scene import Similarity
+from crossgrad_core.contract.georeference import Similarity
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.camera_path import camera_path, zoom_path
 from crossgrad_core.run.results import video

@@ -816,13 +816,13 @@ class OneNote(NoExposure):
 
 
 class RoundsWhatItWrites(Ply):
-    def write(self, gaussians, similarity, path, comments):
-        gaussians.sh_rest.round_(decimals=1)
-        return super().write(gaussians, similarity, path, comments)
+    def write(self, content, path):
+        content.gaussians.sh_rest.round_(decimals=1)
+        return super().write(content, path)
 
 
 class RoundsWhatItStores(Ply):
-    def stored(self, gaussians):
+    def stored(self, gaussians, similarity):
         gaussians.sh_dc.round_(decimals=1)
         return gaussians
 

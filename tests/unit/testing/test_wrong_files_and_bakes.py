@@ -20,28 +20,28 @@ class Centres(api.Exporter):
 
     suffix: ClassVar[str] = "raw"
 
-    def content(self, gaussians, similarity):
+    def numbers(self, gaussians, similarity):
         return similarity.to_input(gaussians.means.double().numpy())
 
-    def write(self, gaussians, similarity, path, comments):
+    def write(self, content, path):
         with api.atomic_file(path) as file:
-            file.write(self.content(gaussians, similarity).tobytes())
+            file.write(self.numbers(content.gaussians, content.similarity).tobytes())
         return ()
 
 
 class LocalFrame(Centres):
-    def content(self, gaussians, similarity):
+    def numbers(self, gaussians, similarity):
         return gaussians.means.double().numpy()
 
 
 class OffsetAlone(Centres):
-    def content(self, gaussians, similarity):
+    def numbers(self, gaussians, similarity):
         return gaussians.means.double().numpy() + similarity.offset
 
 
 class InPlace(Centres):
-    def write(self, gaussians, similarity, path, comments):
-        path.write_bytes(self.content(gaussians, similarity).tobytes())
+    def write(self, content, path):
+        path.write_bytes(self.numbers(content.gaussians, content.similarity).tobytes())
         return ()
 
 

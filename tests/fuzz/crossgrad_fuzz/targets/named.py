@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from crossgrad_core.contract.scene import Similarity
+from crossgrad_core.contract.georeference import Similarity
 from crossgrad_core.run import camera_path
 from crossgrad_core.training import per_image_params
 from crossgrad_fuzz.case import Case

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from crossgrad_core.contract.scene import Similarity
+from crossgrad_core.contract.georeference import Similarity
 from crossgrad_core.system import ply_table
 from crossgrad_fuzz.case import Case
 from crossgrad_fuzz.mutate import COUNTS, NUMBERS, matcher
