@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from crossgrad_core.commands import UserError, configured, fingerprint, read_scene, write_atomically
 from crossgrad_core.run.postprocess import evaluate
+from crossgrad_core.run.postprocess.drawn_file import DrawnFile
 from crossgrad_core.run.postprocess.open_options import How
 from crossgrad_core.run.results.metrics_csv import write_per_view
 from crossgrad_core.scene.fingerprint import mark_of
@@ -138,7 +139,7 @@ class Table:
         print(folder, file=sys.stderr, flush=True)
         how = How(threads=1)
         if self.file:
-            result = evaluate.evaluated_file(folder, folder / PLY, how, on)[0]
+            result = evaluate.evaluated_file(folder, DrawnFile(folder / PLY), how, on)[0]
         else:
             result = evaluate.evaluated_on(folder, on, how)[0]
         write_per_view(folder, result, self.path.name)

@@ -127,11 +127,18 @@ def figure(run: Run, regime: str, name: str = PSNR.name) -> float | None:
     return next((value for value in found if value is not None), None)
 
 
+def _loss_of_the_file(run: Run) -> float | None:
+    # Summaries of earlier versions describe the only file under `ply`.
+    exports = run.summary.get("exports") or {"point_cloud.ply": run.summary.get("ply")}
+    loss: float | None = (exports.get("point_cloud.ply") or {}).get("loss")
+    return loss
+
+
 def _cells(own: Sequence[Run], figures: Sequence[str]) -> list[str]:
     factors = {run.config.get("rate_factor") for run in own}
     places = [(regime, figures[0]) for regime in REGIMES]
     places += [("overall", name) for name in figures[1:]]
-    lost = [(run.summary.get("ply") or {}).get("loss") for run in own]
+    lost = [_loss_of_the_file(run) for run in own]
     commits = {str((run.summary.get("environment") or {}).get("commit")) for run in own}
     return [
         ", ".join(sorted("by length" if each is None else f"x {each:g}" for each in factors)),

@@ -10,7 +10,7 @@ users, `--steps` instead of `--seconds` ends runs after a number of steps. The P
 codes are drawn on the held-out views of the last code, which the first code must also hold out.
 Photos have 400 px, or the size given by `--max-size` (0: the default size). A run uses one thread
 for each named core (Linux). The runs of a pair follow each other on these cores. Finished runs are
-not repeated. Figures are measured on the exported PLY on black, drawn by `crossgrad eval --ply`
+not repeated. Figures are measured on the exported PLY on black, drawn by `crossgrad eval --file`
 and, if `--max-size` is not 0, by `viewer.py`. `table OUT --figure NAME` compares another figure of
 the held-out views in summary.json, such as `ssim`.
 
@@ -134,7 +134,7 @@ def _figures(folder: Path, judge: Path, *, independent: bool) -> Row:
         )
     summary = json.loads((folder / "summary.json").read_text())
     ply = folder / "point_cloud.ply"
-    command = [sys.executable, "-m", "crossgrad_core", "eval", str(judge), "--ply", str(ply)]
+    command = [sys.executable, "-m", "crossgrad_core", "eval", str(judge), "--file", str(ply)]
     shown = subprocess.run([*command, "--threads", "1"], check=True, capture_output=True, text=True)
     (drawn,) = (line.split()[2] for line in shown.stdout.splitlines() if line.startswith("overall"))
     run = cg.open(judge)

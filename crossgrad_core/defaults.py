@@ -15,7 +15,6 @@ PLAIN_INITIALIZER: Final = "points"
 #: Initializer that finds points for a scene without points. Messages contain its name.
 INITIALIZER_WITHOUT_POINTS: Final = "triangulated"
 RESOLUTION: Final = "full"
-#: The exporter also reads the file of `--init FILE.ply`.
 EXPORTER: Final = "ply"
 METRICS: Final = "psnr+ssim+ssim-skimage+psnr-track+psnr-cc+lpips"
 #: Densifier for a backbone that names no default.

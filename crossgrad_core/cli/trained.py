@@ -9,11 +9,21 @@ import typer
 from crossgrad_core.errors import UserError
 from crossgrad_core.system.startup import announce
 
-Ply = Annotated[
+File = Annotated[
     Path | None,
     typer.Option(
+        "--file",
         metavar="FILE",
-        help="Evaluate the Gaussians of this PLY file instead, rendered on black as viewers do.",
+        help="Use the Gaussians of this file (PLY, SPZ, SOG, GLB, splat) instead of the model, "
+        "rendered on black as viewers do.",
+    ),
+]
+Viewer = Annotated[
+    str | None,
+    typer.Option(
+        "--as",
+        metavar="playcanvas|mkkellogg|spark|cesium",
+        help="Draw the Gaussians of --file by the rules of this viewer.",
     ),
 ]
 On = Annotated[
@@ -46,21 +56,34 @@ AcceptScene = Annotated[
 ]
 
 
-def evaluate(
+def evaluate(  # noqa: PLR0913, PLR0917 - one parameter per option of the command line
     run: RunFolder,
-    ply: Ply = None,
+    file: File = None,
+    viewer: Viewer = None,
     on: On = None,
     device: Device = None,
     threads: Threads = None,
     accept_scene: AcceptScene = False,
 ) -> None:
     """Evaluate the held-out views of a run again."""
+    _check_viewer(file, viewer)
     announce()
     from crossgrad_core.run.postprocess import evaluate
+    from crossgrad_core.run.postprocess.drawn_file import DrawnFile
     from crossgrad_core.run.postprocess.open_options import How
 
     how = How(device, threads, accept_scene)
-    evaluate.evaluate(run, how, ply, on)
+    evaluate.evaluate(run, how, None if file is None else DrawnFile(file, viewer), on)
+
+
+def _check_viewer(file: Path | None, viewer: str | None) -> None:
+    """Refuse the rules of a viewer for the run's own model, which no viewer draws."""
+    if viewer is not None and file is None:
+        raise UserError(
+            "--as has no effect without --file",
+            where=f"--as {viewer}",
+            todo="add --file with an exported file, such as RUN/point_cloud.ply",
+        )
 
 
 class UpAxis(StrEnum):
@@ -202,14 +225,33 @@ def render(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
             metavar="N", min=2, max=100_000, help="Number of frames of a zoom path. Default: 120."
         ),
     ] = None,
+    evolution: Annotated[
+        bool,
+        typer.Option(
+            "--evolution",
+            help="Render a video of the first held-out view at each kept checkpoint "
+            "(`crossgrad run --save-every N` keeps them).",
+        ),
+    ] = False,
+    file: File = None,
+    viewer: Viewer = None,
     device: Device = None,
     threads: Threads = None,
     accept_scene: AcceptScene = False,
 ) -> None:
     """Render the views of a run as PNG files."""
+    _check_viewer(file, viewer)
     alone = "a video shows the views of the cameras on its path"
     _check_together(("--on", on), ("--path", path), alone)
     _check_together(("--split", split), ("--path", path), alone)
+    _check_together(("--file", file), ("--path", path), "a video shows the model of the run")
+    others = {"--split": split, "--on": on, "--path": path, "--file": file}
+    for option, value in others.items():
+        _check_together(
+            (option, value),
+            ("--evolution", evolution or None),
+            "a video of the training shows the first held-out view",
+        )
     _check_together(("--split", split), ("--on", on), "all views of the other capture are rendered")
     if frames is not None and path is None:
         raise UserError(
@@ -219,13 +261,17 @@ def render(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
         )
     announce()
     from crossgrad_core.run.postprocess import render
+    from crossgrad_core.run.postprocess.drawn_file import DrawnFile
     from crossgrad_core.run.postprocess.open_options import How
 
     how = How(device, threads, accept_scene)
     if path is not None:
         render.render_path(run, path, frames=frames, out=out, how=how)
-        return
-    render.render(run, split=split or "test", out=out, how=how, on=on)
+    elif evolution:
+        render.render_evolution(run, out=out, how=how)
+    else:
+        drawn = None if file is None else DrawnFile(file, viewer)
+        render.render(run, split=split or "test", out=out, how=how, on=on, file=drawn)
 
 
 def _check_together(option: tuple[str, object], other: tuple[str, object], why: str) -> None:

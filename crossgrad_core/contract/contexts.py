@@ -491,11 +491,14 @@ class EvaluationReport:
         step: The step.
         row: The new row of metrics.csv.
         regimes: The regimes of the held-out views; `psnr_far` is the PSNR of regime `far`.
+        render: Returns the image [H, W, 3] of a view as it was evaluated; only valid during the
+            event. None if views cannot be rendered.
     """
 
     step: int
     row: Mapping[str, float | int | str | None]
     regimes: tuple[str, ...] = ()
+    render: Callable[[View], Tensor] | None = None
 
 
 @dataclass(frozen=True, eq=False)

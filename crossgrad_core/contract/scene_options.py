@@ -32,10 +32,10 @@ class SceneOptions(BaseModel):
         description="Hold out each N-th image of a folder or regime, in the order of names. "
         "Default: 8.",
     )
-    init: Annotated[str, Flag("points|random|PLY", SCENE)] = Field(
+    init: Annotated[str, Flag("points|random|FILE", SCENE)] = Field(
         "points",
-        description="Start of training: the scene's points, random points, or a PLY of "
-        "Gaussians. Default: points.",
+        description="Start of training: the scene's points, random points, or a file of "
+        "Gaussians (PLY, SPZ, SOG, GLB, splat). Default: points.",
     )
     points: Annotated[Path | None, Flag("FILE", SCENE)] = Field(
         None,
@@ -60,5 +60,5 @@ class SceneOptions(BaseModel):
 
     @property
     def init_file(self) -> Path | None:
-        """The PLY file from which the run starts; None if it starts from points."""
+        """The file of Gaussians from which the run starts; None if it starts from points."""
         return None if self.init in {"points", "random"} else Path(self.init)

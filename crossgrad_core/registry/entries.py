@@ -17,7 +17,16 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar, cast, overload
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.requirements import unmet_requirement
 from crossgrad_core.registry.signatures import defined_at, raised_at, wrong_signatures
-from crossgrad_core.registry.slots import COMMANDS, GROUPS, MANY, OFFERED, PLANNERS, QUICK, strays
+from crossgrad_core.registry.slots import (
+    COMMANDS,
+    GROUPS,
+    MANY,
+    OFFERED,
+    PLANNERS,
+    QUICK,
+    VIEWERS,
+    strays,
+)
 from crossgrad_core.system.version import VERSION
 from crossgrad_core.wording import (
     did_you_mean,
@@ -304,7 +313,7 @@ def _offers(path: tuple[str, ...]) -> dict[str, tuple[Entry, ...]]:  # noqa: ARG
     # distribution.
     points = entry_points()
     offers_by_slot: dict[str, tuple[Entry, ...]] = {}
-    groups = [*OFFERED.items(), (PLANNERS, f"crossgrad.{PLANNERS}")]
+    groups = [*OFFERED.items(), *((slot, f"crossgrad.{slot}") for slot in (PLANNERS, VIEWERS))]
     for key, slot, group in [
         *((slot, slot, group) for slot, group in groups),
         *((group, slot, group) for slot, group in QUICK.items()),
@@ -343,7 +352,10 @@ def _unknown(slot: str, name: str) -> UserError:
         f"there is no {singular(slot)} named {name!r}",
         where=singular(slot),
         expected=f"one of {listed(names)}" if names else "an installed plugin; none is installed",
-        todo=sentences(hint, f"`crossgrad plugins list --slot {slot}` lists them"),
+        todo=sentences(
+            hint,
+            f"`crossgrad plugins list --slot {slot}` lists them" if slot in OFFERED else "",
+        ),
     )
 
 

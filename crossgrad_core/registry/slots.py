@@ -42,6 +42,8 @@ OFFERED: Final[dict[str, str]] = {**GROUPS, COMMANDS: f"crossgrad.{COMMANDS}"}
 #: The group of planners, which decide settings of a run from its scene (`--plan`). It is not a slot
 #: of a run.
 PLANNERS: Final = "planners"
+#: The group of functions that draw Gaussians as a program for viewing them does (`eval --as`).
+VIEWERS: Final = "viewers"
 #: Slot -> entry-point group of functions that answer for `auto` before a component is imported:
 #: `accepts` of a reader, `speed` of a rasterizer.
 QUICK: Final = {
@@ -50,7 +52,12 @@ QUICK: Final = {
 }
 #: The core's own commands. No plugin replaces them.
 OWN_COMMANDS: Final = ("run", "eval", "render", "export")
-_KNOWN: Final = (*OFFERED.values(), *QUICK.values(), f"crossgrad.{PLANNERS}")
+_KNOWN: Final = (
+    *OFFERED.values(),
+    *QUICK.values(),
+    f"crossgrad.{PLANNERS}",
+    f"crossgrad.{VIEWERS}",
+)
 _PREFIX: Final = "crossgrad"
 #: A group without the prefix `crossgrad` counts as misspelt if its similarity to a known group is
 #: above this value.

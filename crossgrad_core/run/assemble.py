@@ -12,10 +12,9 @@ from crossgrad_core.contract.objections import objections_to
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.schedule import Counting, ViewsPerStepSpec
 from crossgrad_core.contract.selection import Selection
-from crossgrad_core.contract.slots.exporter import Exporter
 from crossgrad_core.contract.slots.observer import Observer
 from crossgrad_core.contract.slots.reader import Reader
-from crossgrad_core.defaults import EXPORTER, READER
+from crossgrad_core.defaults import READER
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.recipe.table import is_complete
 from crossgrad_core.registry.entries import (
@@ -26,6 +25,7 @@ from crossgrad_core.registry.entries import (
     quick_answer,
     refuse_other_version,
 )
+from crossgrad_core.registry.file_formats import exporter_for
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.registry.slots import GROUPS, LISTS, MANY
 from crossgrad_core.run.decisions import DEFAULT_STEPS, with_decisions
@@ -233,7 +233,7 @@ def _with_first_degree(config: RunConfig) -> RunConfig:
     path = config.data.init_file
     if config.sh_from is not None or path is None:
         return config
-    degree = build(Exporter, EXPORTER, {}).sh_degree_of(path)
+    degree = exporter_for(path, "--init").sh_degree_of(path)
     return config.model_copy(update={"sh_from": degree})
 
 

@@ -54,7 +54,7 @@ class Session:
         self.machine = Machine()
         self._table = table
         self._result: tuple[int, EvaluationResult] | None = None
-        self._exported: Exported | None = None
+        self._exports: dict[str, Exported] = {}
         self._saved_step = -1
         self._evaluated_step = -1
 
@@ -89,9 +89,10 @@ class Session:
         if panels > 0:
             views = setup.scene.test_views
             writer = PanelWriter.of(self.folder, state.step, views, panels)
+        draw = renderer(setup, state)
         result = evaluate(
             setup.scene.test_views,
-            renderer(setup, state),
+            draw,
             setup.metrics,
             on_view=None if writer is None else writer.write,
             points=setup.scene.points,
@@ -105,7 +106,7 @@ class Session:
         self._evaluated_step = state.step
         if self._saved_step == state.step:
             renew_scalars(latest(self.folder), {KEPT: kept_files(self.folder)})
-        report = EvaluationReport(state.step, row, tuple(result.regimes))
+        report = EvaluationReport(state.step, row, tuple(result.regimes), draw)
         setup.hook.crossgrad_evaluation(report=report)
 
     def save(self, setup: Setup, state: TrainState) -> None:
@@ -175,9 +176,9 @@ class Session:
         """Write the trained scene and log a description of the file."""
         path = self.folder / f"{CLOUD}.{setup.selection.exporter.suffix}"
         with reporting(state):
-            self._exported = export_scene(setup, state, path)
+            self._exports[path.name] = export_scene(setup, state, path)
             write_photos(setup, state, self.folder / PHOTO_VALUES)
-        for line in described(self._exported, path):
+        for line in described(self._exports[path.name], path):
             setup.hook.crossgrad_log(text=line)
 
     def summarise(
@@ -191,7 +192,7 @@ class Session:
             scene=setup.scene.name,
             totals=totals(setup, state),
             result=self.result(state.step),
-            ply=None if self._exported is None else self._exported.as_data(),
+            exports={name: exported.as_data() for name, exported in self._exports.items()},
             rows=read_metrics(self.folder),
             seconds=state.clock,
             config=setup.config.model_dump(mode="json"),

@@ -109,7 +109,7 @@ def _of_density_control(config: RunConfig, setup: Setup) -> Iterator[tuple[str, 
             f"densifier {name} makes no edits, and auto sets no limit on the start",
         )
     elif not densifier.edits and config.max_gaussians and config.data.init_file is not None:
-        yield "max_gaussians", f"densifier {name} makes no edits, and a PLY is used unchanged"
+        yield "max_gaussians", f"densifier {name} makes no edits, and a file is used unchanged"
 
 
 def _of_resets(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:

@@ -25,13 +25,12 @@ from crossgrad_core.contract.blocks import (
 )
 from crossgrad_core.contract.component import answered
 from crossgrad_core.contract.scene import Scene
-from crossgrad_core.contract.slots.exporter import Exporter
 from crossgrad_core.contract.slots.loss import Loss
-from crossgrad_core.defaults import EXPORTER
 from crossgrad_core.errors import UserError
 from crossgrad_core.gradients.sparse_rows import sparse_rows
 from crossgrad_core.numerics.kernel_cache import notes_on_missing
 from crossgrad_core.registry.entries import build
+from crossgrad_core.registry.file_formats import exporter_for
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.system.checksums import warn_if_changed
 from crossgrad_core.system.cores import available_cores
@@ -151,12 +150,12 @@ def first_state(setup: Setup) -> TrainState:
 
 
 def initial_parameters(setup: Setup, rng: np.random.Generator) -> tuple[Parameters, int | None]:
-    """Return parameters made from SfM points, from random points, or from a PLY of Gaussians.
+    """Return parameters made from SfM points, from random points, or from a file of Gaussians.
 
     If the points would make more primitives than the user's bound, points are drawn at random, so
     that the run starts with the share `BEGINNING` of the bound. The remaining share is left for
     density control, which places primitives where the photos need them. Without density control,
-    the run starts with the full bound. A PLY is used unchanged.
+    the run starts with the full bound. A file of Gaussians is used unchanged.
 
     Returns:
         The parameters, and the number of primitives that all points would have made; None if all
@@ -165,7 +164,8 @@ def initial_parameters(setup: Setup, rng: np.random.Generator) -> tuple[Paramete
     data, scene = setup.config.data, setup.scene
     if data.init_file is not None:
         warn_if_changed(data.init_file)
-        gaussians = build(Exporter, EXPORTER, {}).read(data.init_file, scene.similarity)
+        exporter = exporter_for(data.init_file, "--init")
+        gaussians = exporter.read(data.init_file, scene.similarity)
         return _made(setup, setup.backbone.adopt(gaussians, scene, rng), "adopt"), None
     begun = with_random_points(scene, rng) if data.init == "random" else _begun(setup)
     parameters = _made(setup, setup.backbone.create(begun, rng), "create")
@@ -277,7 +277,7 @@ def start_notes(setup: Setup, state: TrainState) -> tuple[str, ...]:
             return ()
         return (
             (
-                f"start: {present:,} Gaussians, more than --max-gaussians {most:,}: a PLY is "
+                f"start: {present:,} Gaussians, more than --max-gaussians {most:,}: a file is "
                 "used unchanged, and no Gaussians are added"
             ),
         )

@@ -13,6 +13,7 @@ from crossgrad_core.run import app
 from crossgrad_core.run import cross_capture as elsewhere_module
 from crossgrad_core.run.cross_capture import _alike
 from crossgrad_core.run.postprocess import evaluate, render
+from crossgrad_core.run.postprocess.drawn_file import DrawnFile
 from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
 
 PLACE = {"scale": 7.0, "offset": (40.0, -20.0, 3.0)}
@@ -73,13 +74,14 @@ def test_cross_capture_leaves_training_photos_out_and_repeats_held_out_metrics(
 def test_a_ply_has_the_same_cross_capture_metrics_as_the_model(trained, scene, capsys):
     model, _ = evaluate.evaluated_on(trained, scene)
     before = sorted(trained.rglob("*"))
-    file, gaussians, there = evaluate.evaluated_file(trained, trained / "point_cloud.ply", on=scene)
+    cloud = DrawnFile(trained / "point_cloud.ply")
+    file, gaussians, there = evaluate.evaluated_file(trained, cloud, on=scene)
     assert gaussians > 0 and there is not None and there.trained == 7
     for mine, other in zip(file.views, model.views, strict=True):
         assert mine.name == other.name
         # The model is vanilla on black: the file holds all of it, rounded to float32.
         assert mine.values["psnr"] == pytest.approx(other.values["psnr"], abs=0.02)
-    evaluate.evaluate(trained, ply=trained / "point_cloud.ply", on=scene)
+    evaluate.evaluate(trained, file=cloud, on=scene)
     printed = capsys.readouterr().out
     assert "rendered on black" in printed and "left out: 7 views" in printed
     assert sorted(trained.rglob("*")) == before

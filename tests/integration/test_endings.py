@@ -214,7 +214,7 @@ def test_an_observer_that_raises_when_the_run_starts_fails_the_run(
     assert "ValueError: no start" in capsys.readouterr().err
     found = summary(tmp_path / "run")
     assert (found["status"], found["step"], found["overall"]) == ("failed", 0, None)
-    assert found["ply"] is None
+    assert found["exports"] == {}
 
 
 class Signals:
@@ -273,7 +273,7 @@ def test_a_second_signal_skips_evaluation_but_saves_a_checkpoint(
     found = summary(out)
     assert (found["status"], found["step"]) == ("stopped", 4)
     assert load(latest(out)).step == 4
-    assert found["ply"] is None and not (out / "point_cloud.ply").exists()
+    assert found["exports"] == {} and not (out / "point_cloud.ply").exists()
     with_plugin.clear()
     assert resumed(out) == 0
     assert_same(out, whole)

@@ -12,8 +12,9 @@ from support.scenes import write_tiny_scene
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.run import app, load_run
+from crossgrad_core.run.export import ExportOptions
 from crossgrad_core.run.postprocess import evaluate, export, render
-from crossgrad_core.run.postprocess.open_options import How
+from crossgrad_core.run.postprocess.open_options import AS_IT_IS, How
 from crossgrad_core.run.results.lock import locked
 from crossgrad_plugins.exporters.ply_file import read_ply
 
@@ -58,8 +59,8 @@ def new_files(folder: Path, before: dict[str, bytes]) -> set[str]:
     return set(now) - set(before)
 
 
-def export_file(folder, **options):
-    export.export(folder, **{"file_format": "ply", "out": None, **options})
+def export_file(folder, out=None, how=AS_IT_IS, **options):
+    export.export(folder, file_format="ply", out=out, options=ExportOptions(**options), how=how)
 
 
 def test_baking_for_a_view_does_not_replace_the_file_of_the_summary(finished, capsys):
@@ -215,7 +216,7 @@ def test_a_ply_is_evaluated_on_black_and_nothing_is_written(scene, tmp_path, cap
     grey = tmp_path / "grey"
     assert run(scene, grey, background="0.5,0.5,0.5") == 0
     told = json.loads((grey / "summary.json").read_text())
-    ply = told["ply"]
+    ply = told["exports"]["point_cloud.ply"]
     assert (ply["background"], ply["baked_for"]) == ("0.5,0.5,0.5", None)
     assert ply["live_psnr"] == pytest.approx(told["overall"]["psnr"], abs=1e-3)
     assert ply["loss"] == pytest.approx(ply["live_psnr"] - ply["psnr"])
@@ -223,7 +224,7 @@ def test_a_ply_is_evaluated_on_black_and_nothing_is_written(scene, tmp_path, cap
     before = content(grey)
     own, _ = figures_of(grey, capsys)
     before = content(grey)
-    drawn, printed = figures_of(grey, capsys, "--ply", str(grey / "point_cloud.ply"))
+    drawn, printed = figures_of(grey, capsys, "--file", str(grey / "point_cloud.ply"))
     assert not new_files(grey, before)
     assert own == pytest.approx(ply["live_psnr"], abs=6e-3)
     assert drawn == pytest.approx(ply["psnr"], abs=6e-3)
@@ -251,8 +252,8 @@ def test_a_ply_trained_on_black_has_the_metrics_of_the_run(scene, tmp_path, caps
     assert run(scene, out) == 0
     capsys.readouterr()
     own, _ = figures_of(out, capsys)
-    drawn, _ = figures_of(out, capsys, "--ply", str(out / "point_cloud.ply"))
+    drawn, _ = figures_of(out, capsys, "--file", str(out / "point_cloud.ply"))
     assert drawn == pytest.approx(own, abs=6e-3)
     other = tmp_path / "none.ply"
-    assert ended("eval", str(out), "--ply", str(other)) == 2
+    assert ended("eval", str(out), "--file", str(other)) == 2
     assert str(other) in capsys.readouterr().err

@@ -97,7 +97,7 @@ def evaluated(monkeypatch):
 
     monkeypatch.setattr(evaluate, "evaluated_on", measured)
     monkeypatch.setattr(
-        evaluate, "evaluated_file", lambda run, ply, how, on: measured(run, on, how)
+        evaluate, "evaluated_file", lambda run, file, how, on: measured(run, on, how)
     )
     return told
 

@@ -5,15 +5,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from crossgrad_core.contract.slots.exporter import Exporter
-from crossgrad_core.defaults import EXPORTER
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import evaluate as measured
 from crossgrad_core.evaluation.result import EvaluationResult, ViewMetrics
-from crossgrad_core.registry.entries import build
 from crossgrad_core.run.cross_capture import Elsewhere, elsewhere
-from crossgrad_core.run.export import drawer, plain_drawer, plain_renderer, renderer
+from crossgrad_core.run.export import plain_renderer, renderer
 from crossgrad_core.run.load_run import require_checkpoint
+from crossgrad_core.run.postprocess.drawn_file import DrawnFile
 from crossgrad_core.run.postprocess.open_options import AS_IT_IS, Opens
 from crossgrad_core.run.postprocess.output_paths import is_changed, own_name, writing_if_possible
 from crossgrad_core.run.results.metrics_csv import PER_VIEW, Totals, read_per_view, write_per_view
@@ -21,31 +19,34 @@ from crossgrad_core.run.results.panels import ending
 from crossgrad_core.run.results.sources import name_for
 from crossgrad_core.run.results.summary import final_table, metric_lines
 from crossgrad_core.run.session import totals
-from crossgrad_core.system.checksums import relisted, warn_if_changed
+from crossgrad_core.system.checksums import relisted
 from crossgrad_core.wording import listed
 
 _LOG = logging.getLogger(__name__)
 
 
 def evaluate(
-    folder: Path, how: Opens = AS_IT_IS, ply: Path | None = None, on: Path | None = None
+    folder: Path,
+    how: Opens = AS_IT_IS,
+    file: DrawnFile | None = None,
+    on: Path | None = None,
 ) -> None:
     """Evaluate the held-out views of a run again, or other views; print the table.
 
     Args:
         folder: The run's folder.
         how: The options for opening the run.
-        ply: A file whose Gaussians are rendered instead of the run's model.
+        file: A file whose Gaussians are rendered instead of the run's model.
         on: Another capture of the place; its views are rendered instead of the held-out views.
 
     Raises:
         UserError: See `evaluated`, `evaluated_file` and `evaluated_on`.
     """
-    if ply is not None:
-        result, gaussians, capture = evaluated_file(folder, ply, how, on)
-        ply_line = f"{gaussians:,} Gaussians of {ply}, rendered on black as viewers do"
+    if file is not None:
+        result, gaussians, capture = evaluated_file(folder, file, how, on)
+        line = f"{gaussians:,} Gaussians of {file.path}, rendered on black {file.manner}"
         print(  # noqa: T201
-            "\n".join([*metric_lines(result), ply_line, *(capture.messages() if capture else ())])
+            "\n".join([*metric_lines(result), line, *(capture.messages() if capture else ())])
         )
     elif on is not None:
         result, there = evaluated_on(folder, on, how)
@@ -85,15 +86,15 @@ def evaluated_on(
 
 
 def evaluated_file(
-    folder: Path, ply: Path, how: Opens = AS_IT_IS, on: Path | None = None
+    folder: Path, file: DrawnFile, how: Opens = AS_IT_IS, on: Path | None = None
 ) -> tuple[EvaluationResult, int, Elsewhere | None]:
-    """Evaluate the Gaussians of a PLY on the held-out views of a run, with the run's exposures.
+    """Evaluate the Gaussians of a file on the held-out views of a run, with the run's exposures.
 
     Nothing is written.
 
     Args:
         folder: The run's folder.
-        ply: The file, in the coordinates of the scene's input; any program may have written it.
+        file: The file, and the rules by which it is drawn.
         how: The options for opening the run.
         on: Another capture of the place, whose views are rendered instead, without exposures (see
             `evaluated_on`).
@@ -107,14 +108,13 @@ def evaluated_file(
     """
     require_checkpoint(folder)
     setup, state = how.open(folder)
-    warn_if_changed(ply)
-    gaussians = build(Exporter, EXPORTER, {}).read(ply, setup.scene.similarity)
+    gaussians = file.gaussians(setup)
     if on is None:
         there, views, points = None, setup.scene.test_views, setup.scene.points
-        draw = drawer(setup, state, gaussians)
     else:
         there = elsewhere(setup, on)
-        views, points, draw = there.views, there.points, plain_drawer(setup, gaussians)
+        views, points = there.views, there.points
+    draw = file.drawer(setup, gaussians, None if there else state)
     return measured(views, draw, setup.metrics, points=points), len(gaussians), there
 
 

@@ -11,6 +11,8 @@ from crossgrad_core.run.export import Exported, ExportOptions, described, export
 from crossgrad_core.run.postprocess.open_options import AS_IT_IS, Opens
 from crossgrad_core.run.postprocess.output_paths import own_name, writing
 from crossgrad_core.run.results.panels import flat_names
+from crossgrad_core.run.results.summary import FILE as SUMMARY
+from crossgrad_core.run.results.summary import add_export
 from crossgrad_core.run.session import CLOUD
 from crossgrad_core.system.check_writable import check_file, check_new
 from crossgrad_core.system.checksums import relisted
@@ -96,8 +98,12 @@ def exported(
         else:
             path = out or folder / name
             check_new(path)
-        with relisted(folder, *(() if out else (path.name, georef_of(path).name))):
-            return path, export_scene(setup, state, path, exporter, options)
+        own = () if out else (path.name, georef_of(path).name, SUMMARY)
+        with relisted(folder, *own):
+            content = export_scene(setup, state, path, exporter, options)
+            if out is None:
+                add_export(folder, path.name, content.as_data())
+            return path, content
 
 
 def _check_name(out: Path | None, exporter: Exporter) -> None:

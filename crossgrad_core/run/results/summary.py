@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -39,7 +39,7 @@ class Summary:
         seconds: Wall-clock seconds by activity; training seconds also by phase.
         config: The resolved configuration as plain data, including the seed.
         environment: Machine and versions.
-        ply: Description of the PLY; None if none was written.
+        exports: Name of an exported file -> its description.
         notes: Choices and omissions, with their reasons.
         decisions: The table of decided settings.
         check: Results of the consistency check of the scene; None without a check.
@@ -54,7 +54,7 @@ class Summary:
     seconds: "Clock"
     config: Mapping[str, Any]
     environment: "Mapping[str, Json]"
-    ply: "Mapping[str, Json] | None" = None
+    exports: "Mapping[str, Mapping[str, Json]]" = field(default_factory=dict)
     notes: Sequence[str] = ()
     decisions: Sequence[Decision] = ()
     check: "Mapping[str, Json] | None" = None
@@ -67,7 +67,26 @@ def write_summary(folder: Path, summary: Summary) -> None:
     Raises:
         UserError: The disk is full.
     """
-    text = json.dumps(_finite(_as_data(summary)), indent=2, ensure_ascii=False, default=str)
+    _write(folder, _as_data(summary))
+
+
+def add_export(folder: Path, name: str, described: "Mapping[str, Json]") -> None:
+    """Add the description of a later export to summary.json; a missing or damaged file stays so.
+
+    Raises:
+        UserError: The disk is full.
+    """
+    try:
+        summary = read_summary(folder)
+    except UserError:
+        return
+    exports = summary.get("exports")
+    kept = exports if isinstance(exports, dict) else {}
+    _write(folder, {**summary, "exports": {**kept, name: dict(described)}})
+
+
+def _write(folder: Path, data: Mapping[str, Any]) -> None:
+    text = json.dumps(_finite(data), indent=2, ensure_ascii=False, default=str)
     write_atomically(folder / FILE, text_bytes(text + "\n"))
 
 
@@ -118,7 +137,7 @@ def _as_data(summary: Summary) -> dict[str, Any]:
         **asdict(summary.totals),
         **_metrics(summary.result),
         "best": best_of(summary.rows),
-        "ply": None if summary.ply is None else dict(summary.ply),
+        "exports": {name: dict(described) for name, described in summary.exports.items()},
         "seconds": {
             name: value for name, value in asdict(summary.seconds).items() if name != "cpu"
         },

@@ -1,4 +1,4 @@
-"""The PLY file of 3DGS, which all viewers of Gaussians can open."""
+"""The PLY file of 3DGS, which all viewers of Gaussians can open; compressed PLY is read only."""
 
 from pathlib import Path
 from typing import ClassVar
@@ -6,13 +6,10 @@ from typing import ClassVar
 from typing_extensions import override
 
 from crossgrad_core.plugin import ExportContent, Exporter, Gaussians, Response, Rounding, Similarity
+from crossgrad_plugins.exporters.compressed_ply import is_compressed, read_compressed
+from crossgrad_plugins.exporters.file_units import FileCloud
 from crossgrad_plugins.exporters.ply_cloud import SplatCloud
-from crossgrad_plugins.exporters.ply_file import (
-    position_rounding,
-    read_ply,
-    sh_degree_of,
-    write_ply,
-)
+from crossgrad_plugins.exporters.ply_file import read_ply, sh_degree_of, write_ply
 
 
 class Ply(Exporter):
@@ -28,7 +25,7 @@ class Ply(Exporter):
 
     @override
     def rounding(self, gaussians: Gaussians, similarity: Similarity) -> Rounding:
-        return position_rounding(SplatCloud.from_gaussians(gaussians), similarity)
+        return FileCloud.of(SplatCloud.from_gaussians(gaussians), similarity).float32_rounding
 
     @override
     def stored(self, gaussians: Gaussians, similarity: Similarity) -> Gaussians:
@@ -36,8 +33,9 @@ class Ply(Exporter):
 
     @override
     def read(self, path: Path, similarity: Similarity) -> Gaussians:
-        return read_ply(path).to_local(similarity).to_gaussians()
+        cloud = read_compressed(path) if is_compressed(path) else read_ply(path)
+        return cloud.to_local(similarity).to_gaussians()
 
     @override
     def sh_degree_of(self, path: Path) -> int:
-        return sh_degree_of(path)
+        return read_compressed(path).sh_degree if is_compressed(path) else sh_degree_of(path)

@@ -1,6 +1,7 @@
 """The readable rasterizer: plain PyTorch, any device, float32 or float64, gradients by autograd."""
 
 from dataclasses import replace
+from functools import partial
 from typing import ClassVar
 
 import torch
@@ -22,7 +23,13 @@ from crossgrad_plugins.rasterizers.reference.compositing import (
     tile_lists,
 )
 from crossgrad_plugins.rasterizers.reference.harmonics import view_colors
-from crossgrad_plugins.rasterizers.reference.projection import Projection, Shape, project, shape
+from crossgrad_plugins.rasterizers.reference.projection import (
+    Projection,
+    Shape,
+    coverage,
+    project,
+    shape,
+)
 from crossgrad_plugins.rasterizers.reference.statistics import Recorder, longest_axes, recorded
 
 #: Number of standard deviations, and lower bound of the squared half difference of the variances
@@ -110,7 +117,8 @@ class TorchRasterizer(Rasterizer):
             axes = longest_axes(projection.factors.detach(), drawn.scales.detach())
         recorder = Recorder(screen, index, len(gaussians), "abs_gradient" in outputs, axes)
         table, probe = recorded(table, recorder)
-        drawing = Drawing(size, gaussians.response, self.max_alpha, probe.shape[1])
+        filled = partial(coverage, response=gaussians.response)
+        drawing = Drawing(size, filled, self.max_alpha, probe.shape[1])
         table, lists = torch.cat([probe, table], -1), tile_lists(boxes, size)
         channels, touched, blended = composite_tiles(table, lists, drawing)
         radii = shapes.radii.detach().ceil().clamp(min=1, max=_LARGEST_RADIUS)

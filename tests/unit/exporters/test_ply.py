@@ -11,13 +11,9 @@ import torch
 from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.georeference import Similarity
 from crossgrad_core.errors import UserError
+from crossgrad_plugins.exporters.file_units import position_offset
 from crossgrad_plugins.exporters.ply_cloud import SplatCloud
-from crossgrad_plugins.exporters.ply_file import (
-    PROPERTIES,
-    position_offset,
-    read_ply,
-    write_ply,
-)
+from crossgrad_plugins.exporters.ply_file import PROPERTIES, read_ply, write_ply
 
 UTM = Similarity(np.array([355_142.5, 5_812_377.25, 81.0]), 1 / 60)
 
@@ -234,7 +230,6 @@ def break_header(raw: bytes) -> bytes:
         (break_header, "property"),
         (lambda raw: raw.replace(b"float z", b"float y"), "two properties"),
         (lambda raw: raw.replace(b"float opacity", b"float density"), "no Gaussians"),
-        (lambda raw: raw.replace(b"float x", b"float packed_position"), "compressed"),
         (lambda raw: raw.replace(b"f_rest_44", b"unknown"), "spherical harmonics"),
         (lambda raw: raw.replace(b"Mode: default", b"Mode: 2dgs"), "another renderer"),
         (lambda raw: raw.replace(b"SplatRenderMode:", b"crossgrad_offset:"), "coordinate offset"),

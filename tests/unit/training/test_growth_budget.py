@@ -195,7 +195,7 @@ def test_a_max_gaussians_below_the_number_of_points_leaves_room_for_growth(name,
 def test_a_ply_start_above_max_gaussians_is_reported():
     state = first_state(setup_of("adc"))
     (told,) = start_notes(setup_of("adc", max_gaussians=30), state)
-    assert "more than --max-gaussians 30: a PLY is used unchanged" in told
+    assert "more than --max-gaussians 30: a file is used unchanged" in told
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Front-to-back compositing, tile by tile, as dense [pixels, Gaussians] tensors."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -8,8 +9,7 @@ from torch.nn.functional import embedding
 from torch.utils.checkpoint import checkpoint
 
 from crossgrad_core.numerics.raster_constants import ALPHA_THRESHOLD, TRANSMITTANCE_STOP
-from crossgrad_core.plugin import Response
-from crossgrad_plugins.rasterizers.reference.projection import Shape, coverage
+from crossgrad_plugins.rasterizers.reference.projection import Shape
 from crossgrad_plugins.rasterizers.reference.statistics import offsets
 
 #: Number of composited channels: RGB, depth, and ones for the accumulated opacity.
@@ -28,13 +28,14 @@ class Drawing:
 
     Attributes:
         size: Width and height of the image, pixels.
-        response: The response, which says how a Gaussian fills a pixel.
+        coverage: Returns [P, N] the share of the opacity that each Gaussian contributes to each
+            pixel, for dx [P, N], dy [P, N] (mean minus pixel centre) and the parameters [N, S].
         max_alpha: Cap of alpha; a capped alpha has no gradient.
         probed: Number R of the probe's columns.
     """
 
     size: tuple[int, int]
-    response: Response
+    coverage: Callable[[Tensor, Tensor, Tensor], Tensor]
     max_alpha: float
     probed: int
 
@@ -157,7 +158,7 @@ def _blends(table: Tensor, centers: Tensor, drawing: Drawing) -> tuple[Tensor, T
     columns = [drawing.probed, 2, 1, 4, table.shape[1] - drawing.probed - 7]
     probe, means, opacities, _, parameters = torch.split(table, columns, -1)
     dx, dy = offsets(means, probe, centers, drawing.size)
-    alpha = opacities.T * coverage(dx, dy, parameters, drawing.response)
+    alpha = opacities.T * drawing.coverage(dx, dy, parameters)
     alpha = alpha.clamp(max=drawing.max_alpha)
     touching = alpha >= ALPHA_THRESHOLD
     alpha = torch.where(touching, alpha, 0.0)
