@@ -49,7 +49,11 @@ def content(folder: Path) -> dict[str, bytes]:
     # The list of checksums follows each file that is added.
     files = (path for path in sorted(folder.rglob("*")) if path.is_file())
     files = (path for path in files if path.name != "SHA256SUMS")
-    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+    found = {str(path.relative_to(folder)): path.read_bytes() for path in files}
+    if "summary.json" in found:  # It gets a description of each export.
+        told = {**json.loads(found["summary.json"]), "exports": None}
+        found["summary.json"] = json.dumps(told).encode()
+    return found
 
 
 def new_files(folder: Path, before: dict[str, bytes]) -> set[str]:
@@ -68,6 +72,9 @@ def test_baking_for_a_view_does_not_replace_the_file_of_the_summary(finished, ca
     export_file(finished, camera="street/0002.png")
     assert new_files(finished, before) == {"point_cloud_street__0002.ply"}
     assert str(finished / "point_cloud_street__0002.ply") in capsys.readouterr().out
+    exports = json.loads((finished / "summary.json").read_text())["exports"]
+    assert exports["point_cloud_street__0002.ply"]["baked_for"] == "street/0002.png"
+    assert exports["point_cloud.ply"]["baked_for"] != "street/0002.png"
     files = (finished / name for name in ("point_cloud.ply", "point_cloud_street__0002.ply"))
     own, baked = (read_ply(file).logit_opacities for file in files)
     assert own.shape != baked.shape or (own != baked).any()

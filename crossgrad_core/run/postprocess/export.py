@@ -12,7 +12,7 @@ from crossgrad_core.run.postprocess.open_options import AS_IT_IS, Opens
 from crossgrad_core.run.postprocess.output_paths import own_name, writing
 from crossgrad_core.run.results.panels import flat_names
 from crossgrad_core.run.results.summary import FILE as SUMMARY
-from crossgrad_core.run.results.summary import add_export
+from crossgrad_core.run.results.summary import add_export, summarised_step
 from crossgrad_core.run.session import CLOUD
 from crossgrad_core.system.check_writable import check_file, check_new
 from crossgrad_core.system.checksums import relisted
@@ -101,7 +101,7 @@ def exported(
         own = () if out else (path.name, georef_of(path).name, SUMMARY)
         with relisted(folder, *own):
             content = export_scene(setup, state, path, exporter, options)
-            if out is None:
+            if out is None and summarised_step(folder) == state.step:
                 add_export(folder, path.name, content.as_data())
             return path, content
 
