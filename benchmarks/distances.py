@@ -4,9 +4,9 @@
         --folders ladder mid --bands 4 --baseline ARM
 
 The finished runs of one scene are evaluated on the views of another capture of the same place. They
-were not trained on these views. The evaluation is that of `crossgrad eval RUN --on SCENE
-[--file FILE]`. Finished evaluations are skipped: next to each table, a file records the scene, the
-step and the PLY. The views of each folder are sorted into bands of distance by the size of a pixel on the
+were not trained on these views. The evaluation is that of `crossgrad eval RUN --on SCENE [--file
+FILE]`. Finished evaluations are skipped: next to each table, a file records the scene, the step and
+the PLY. The views of each folder are sorted into bands of distance by the size of a pixel on the
 visible surface, so that a table goes from near to far. The table shows the number of measured views
 in brackets. Only runs that kept their checkpoints can be evaluated.
 """

@@ -113,17 +113,28 @@ class Run:
                 image = camera_renderer(setup, state)(checked_camera(view))
             return np.asarray(image.clamp(0.0, 1.0).cpu().numpy(), dtype=np.float32)
 
-    def evaluate(self) -> "EvaluationResult":
+    def evaluate(
+        self, file: Path | str | None = None, viewer: str | None = None
+    ) -> "EvaluationResult":
         """Evaluate the held-out views again and rewrite per_view.csv, as `crossgrad eval` does.
 
+        Args:
+            file: A file whose Gaussians are drawn on black instead of the model; then nothing is
+                written.
+            viewer: The program whose rules the drawing of `file` follows: playcanvas, mkkellogg,
+                spark or cesium; by default the rules of the run.
+
         Raises:
-            UserError: The run has no checkpoint, or its scene has changed.
+            UserError: The run has no checkpoint, its scene has changed, or the file cannot be read.
         """
         from crossgrad_core.run.app import as_in_a_command
-        from crossgrad_core.run.postprocess.evaluate import evaluated
+        from crossgrad_core.run.postprocess.drawn_file import DrawnFile
+        from crossgrad_core.run.postprocess.evaluate import evaluated, evaluated_file
 
         with as_in_a_command():
-            return evaluated(self.folder, self._opened)[0]
+            if file is None:
+                return evaluated(self.folder, self._opened)[0]
+            return evaluated_file(self.folder, DrawnFile(Path(file), viewer), self._opened)[0]
 
     def export(
         self, path: Path | str, camera: str | None = None, coordinates: str = "input"

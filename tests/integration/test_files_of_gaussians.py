@@ -69,6 +69,8 @@ def test_eval_draws_a_file_by_the_rules_of_a_viewer(files, capsys):
         found, printed = psnr(capsys, files, "--file", file, "--as", viewer)
         assert f"by the rules of {viewer}" in printed
         assert found != own and abs(found - own) < 6.0
+    result = cg.open(files, threads=1).evaluate(file, viewer="cesium")
+    assert result.overall["psnr"] == pytest.approx(found, abs=6e-3)
 
 
 def test_render_draws_the_gaussians_of_a_file_into_a_folder_of_its_own(files, capsys):

@@ -12,7 +12,8 @@ from torch import Tensor
 ENTRIES, LARGEST = 256, 65_536
 #: Number of rows per palette entry.
 _ROWS_PER_ENTRY: Final = 4
-_ROUNDS, _SAMPLE = 8, 100_000
+#: Rounds for a palette and for a codebook. A palette of 8 rounds is 1 % better than one of 3.
+_ROUNDS, _BOOK_ROUNDS, _SAMPLE = 4, 8, 100_000
 #: Entries of a distance matrix that are in memory at the same time.
 _AT_ONCE: Final = 1 << 22
 
@@ -28,7 +29,7 @@ def codebook_of(values: NDArray[np.float32]) -> NDArray[np.float64]:
         np.concatenate([np.linspace(low, high, half), np.quantile(numbers, np.arange(half) / half)])
     )
     sums = np.concatenate([[0.0], np.cumsum(numbers)])
-    for _ in range(_ROUNDS):
+    for _ in range(_BOOK_ROUNDS):
         ends = np.searchsorted(numbers, (book[1:] + book[:-1]) / 2)
         ends = np.concatenate([[0], ends, [len(numbers)]])
         counts = np.diff(ends)

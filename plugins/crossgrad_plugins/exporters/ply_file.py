@@ -92,7 +92,7 @@ def read_ply(path: Path) -> SplatCloud:
             numbers, or has other coordinates than the scene's input.
     """
     vertices = read_vertices(path)
-    _check_coordinates(vertices.comments, path)
+    check_coordinates(vertices.comments, path)
     _require_properties(vertices.columns, path)
     rest = _rest_names(vertices.columns, path)
     _require_gaussians(len(vertices.columns["x"]), path)
@@ -248,11 +248,16 @@ def _offset(comments: Sequence[str], path: Path) -> NDArray[np.float64]:
     return offset
 
 
-def _check_coordinates(comments: Sequence[str], path: Path) -> None:
+def check_coordinates(comments: Sequence[str], path: Path) -> None:
+    """Refuse a file whose comments name other coordinates than those of the scene's input.
+
+    Raises:
+        UserError: The comments name other coordinates.
+    """
     coordinates = _tagged(comments, COORDINATES_TAG)
     if coordinates is not None:
         raise UserError(
-            "the PLY file uses other coordinates than the scene",
+            "the file uses other coordinates than the scene",
             where=path,
             expected="the coordinates of the scene's input files",
             found=coordinates,

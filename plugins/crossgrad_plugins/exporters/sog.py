@@ -29,7 +29,7 @@ class Sog(Exporter):
     @override
     def write(self, content: ExportContent, path: Path) -> tuple[str, ...]:
         units = _units(content.gaussians, content.similarity, path.name)
-        packing = packed(units.cloud, units.offset)
+        packing = packed(units.cloud, units.offset, content.comments)
         with atomic_file(path, len(packing)) as file:
             file.write(packing)
         return units.notes

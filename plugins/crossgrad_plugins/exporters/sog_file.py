@@ -9,7 +9,7 @@ import io
 import json
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import ceil, sqrt
 from pathlib import Path
 from typing import Any, Final
@@ -22,6 +22,7 @@ from crossgrad_core.numerics.raster_constants import COEFFICIENTS
 from crossgrad_core.plugin import UserError, open_file
 from crossgrad_plugins.exporters.palette import codebook_of, nearest_entry, palette_of
 from crossgrad_plugins.exporters.ply_cloud import REST, SplatCloud
+from crossgrad_plugins.exporters.ply_file import check_coordinates
 
 Bytes = NDArray[np.uint8]
 
@@ -39,12 +40,13 @@ _TIME: Final = (1980, 1, 1, 0, 0, 0)
 _MOST: Final = 1 << 30
 
 
-def packed(cloud: SplatCloud, offset: NDArray[np.float64]) -> bytes:
+def packed(cloud: SplatCloud, offset: NDArray[np.float64], comments: Sequence[str] = ()) -> bytes:
     """Return the content of a SOG file.
 
     Args:
         cloud: Finite Gaussians in the units of the file, at least one.
         offset: [3] added to the positions to get coordinates of the file. Other programs ignore it.
+        comments: Lines of plain text about the file.
     """
     means = np.sign(cloud.means) * np.log1p(np.abs(cloud.means))
     low, high = means.min(axis=0), means.max(axis=0)
@@ -65,7 +67,7 @@ def packed(cloud: SplatCloud, offset: NDArray[np.float64]) -> bytes:
         "version": VERSION,
         "count": len(cloud),
         "antialias": cloud.render_mode == "mip",
-        "asset": {"generator": "crossgrad"},
+        "asset": {"generator": "crossgrad", "comments": list(comments)},
         "means": {"mins": low.tolist(), "maxs": high.tolist(), **_files("means_l", "means_u")},
         "scales": {"codebook": scales.tolist(), **_files("scales")},
         "quats": _files("quats"),
@@ -101,13 +103,19 @@ def unpacked(content: bytes, path: Path) -> SplatCloud:
         path: The file, for messages.
 
     Raises:
-        UserError: The content is not a SOG file of version 2, or it is damaged.
+        UserError: The content is not a SOG file of version 2, it is damaged, or it has other
+            coordinates than the scene's input.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            return _cloud(_meta(archive), archive)
+            meta = _meta(archive)
+            asset = meta.get("asset")
+            comments = asset.get("comments", []) if isinstance(asset, dict) else []
+            cloud = _cloud(meta, archive)
     except _DAMAGES as error:
         raise _malformed(path, " ".join(f"{type(error).__name__}: {error}".split())) from error
+    check_coordinates([str(line) for line in comments], path)
+    return cloud
 
 
 def bands_of(path: Path) -> int:

@@ -9,7 +9,7 @@ import gaussforge
 import numpy as np
 import pytest
 
-from crossgrad_core.contract.georeference import Similarity
+from crossgrad_core.contract.georeference import COORDINATES_TAG, Similarity
 from crossgrad_core.contract.slots.exporter import ExportContent
 from crossgrad_core.errors import UserError
 from crossgrad_plugins.exporters.palette import codebook_of, nearest_entry, palette_of
@@ -104,6 +104,12 @@ def test_a_scene_far_from_the_origin_keeps_its_positions(tmp_path):
     assert (read.means - cloud.means).abs().max() < 2e-3
     meta = json.loads(zipfile.ZipFile(path).read("meta.json"))
     assert np.abs(np.array(meta["crossgrad_offset"]) - UTM.offset).max() < 60
+
+
+def test_a_file_in_other_coordinates_is_refused_as_a_start(tmp_path):
+    content = packed(cloud_of(0, 20), NOWHERE, ["crossgrad step 3", f"{COORDINATES_TAG} enu"])
+    with pytest.raises(UserError, match="other coordinates"):
+        unpacked(content, tmp_path)
 
 
 def test_the_antialiased_response_is_a_flag_of_the_file(tmp_path):
