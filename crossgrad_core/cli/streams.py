@@ -1,4 +1,4 @@
-"""Standard streams that never end a command, for closed pipes and limited encodings."""
+"""Standard streams whose failed writes do not end a command."""
 
 import io
 import os
@@ -20,7 +20,7 @@ def outlast_readers() -> None:
 
     Otherwise a closed pipe (`| head`), a lost terminal or a full disk would end hours of training
     at the next progress line. A folder name with characters outside the terminal's encoding would
-    do the same. The messages of a run are also in its log.txt.
+    also end the training. The messages of a run are also in its log.txt.
     """
     _occupy()
     sys.stdout = _lasting(sys.stdout)
@@ -46,7 +46,8 @@ class _LastingFile(io.FileIO):
 def _occupy() -> None:
     """Open the null device for each standard stream that the caller closed (`2>&-`).
 
-    Otherwise the next opened file would get the stream's number, and with it the stream's output.
+    Otherwise the next opened file would get the stream's file descriptor. Messages of the program
+    would then be written into this file.
     """
     while (number := os.open(os.devnull, os.O_RDWR)) <= _HIGHEST:
         pass

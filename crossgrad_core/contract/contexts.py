@@ -52,11 +52,13 @@ class RenderedView:
     Attributes:
         view: The view.
         camera: The camera of the render: the view's camera, resized if `scale` is not 1.
-        scale: Side length of the render divided by the side length of the photo as trained.
+        scale: Side length of the render divided by the side length of the photo at training
+            resolution.
         gaussians: The Gaussians that were rendered.
         screen: Screen statistics in pixels of the render, with gradients if a backward pass has
             run. `contract.screen_statistics` converts the statistics to units of the full photo.
-        image: [H, W, 3] the image that is compared with the photo: the render after exposure.
+        image: [H, W, 3] the render after the exposure model; the loss compares this image with the
+            photo.
         photo: [H, W, 3] uint8 photo, in the size of the render.
         mask: [H, W] bool, True where the pixel counts; None if every pixel counts.
     """
@@ -73,7 +75,7 @@ class RenderedView:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ViewRecord(RenderedView):
-    """One rendered view of a step, after its backward pass, detached.
+    """One rendered view of a step after its backward pass; its tensors are detached.
 
     Attributes:
         index: Position in `scene.train_views`.
@@ -101,8 +103,8 @@ class StepRecord:
         labels: Group labels of the views, or None.
         losses: Photometric losses of the views, in the order of `views`.
         primitives: Number of primitives after the step.
-        counts: Counted events: `zero`, `disjoint`, `dropped`, `conflict` blocks of the aggregation,
-            `cloned`, `split`, `pruned`, `reset` primitives of the densification.
+        counts: Event -> number. The aggregation counts blocks: `zero`, `disjoint`, `dropped`,
+            `conflict`. The densification counts primitives: `cloned`, `split`, `pruned`, `reset`.
         train_seconds: Training seconds since the start of the run, this step included.
         scales: The scales at which the views were rendered and compared; empty if all views had
             their full size.
@@ -124,13 +126,13 @@ PhotoOf = Callable[[View], tuple[Tensor, Tensor | None]]
 
 
 def decoded(view: View) -> tuple[Tensor, Tensor | None]:
-    """Decode and return the photo and the mask of a view, without counting the time."""
+    """Return the decoded photo and mask of a view; the decoding time is not measured."""
     return view.photo.image(), view.photo.mask()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RequestedRender(RenderedView):
-    """A training view as it was rendered on request, through the run's exposure and loss.
+    """A training view that a plugin requested, rendered with the run's exposure and loss.
 
     Attributes:
         render: The output of the rasterizer.
@@ -158,8 +160,8 @@ class RenderOnRequest(Protocol):
     ) -> RequestedRender:
         """Return the rendered view.
 
-        The render is part of a graph if gradients are enabled (`torch.enable_grad()`). A densifier
-        that needs no gradients calls this function under `torch.no_grad()`.
+        The render is part of an autograd graph if gradients are enabled (`torch.enable_grad()`). A
+        densifier that needs no gradients calls this function under `torch.no_grad()`.
 
         Args:
             view: Position in `scene.train_views`.
@@ -255,7 +257,8 @@ class PixelContext(StepContext):
         index: Position of the view in `scene.train_views`.
         view: The view.
         camera: The camera of the render.
-        scale: Side length of the render divided by the side length of the photo as trained.
+        scale: Side length of the render divided by the side length of the photo at training
+            resolution.
         target: [H, W, 3] uint8 photo that the render is compared with, in the size of the render.
         mask: [H, W] bool, True where the pixel counts; None if every pixel counts.
     """
@@ -277,9 +280,10 @@ class AggregateContext(StepContext):
             separate gradients.
         losses: [K] float64 photometric losses.
         labels: K group labels, or None.
-        distances: [K] float64 distance of each camera from the mean training camera, local units.
-        reference_distance: Median of the distances of all training cameras from the mean training
-            camera.
+        distances: [K] float64 distance of each camera from the mean position of the training
+            cameras, local units.
+        reference_distance: Median distance of the training cameras from their mean position, local
+            units.
         blocks: The blocks, in the order of every Gramian's first dimension.
         scales: K scales at which losses and gradients were computed; empty if all are 1.
     """
@@ -315,8 +319,8 @@ class RegularizeContext(StepContext):
     Attributes:
         parameters: The parameters, requiring gradients.
         backbone: The backbone.
-        gaussians: The Gaussians that the backbone decoded for this view, with their graph; None if
-            the hook is called for the whole step.
+        gaussians: The Gaussians that the backbone decoded for this view, with their autograd graph;
+            None if the hook is called for the whole step.
         view: The view; None if the hook is called for the whole step.
     """
 
@@ -434,7 +438,7 @@ class RunInfo:
         config: The resolved configuration as plain data.
         schedule: The schedule.
         blocks: The blocks of the backbone.
-        notes: Messages about choices and omissions, with reasons.
+        notes: Messages about the run's choices, with reasons.
         decisions: The table of decided settings.
     """
 
@@ -454,7 +458,8 @@ class Model:
     Plugins must not change any of its contents.
 
     Attributes:
-        phase: The phase in which training decodes; `phase.step` is the last complete step.
+        phase: The phase that the backbone needs to decode the Gaussians; `phase.step` is the last
+            complete step.
         scene: The scene.
         backbone: The backbone.
         rasterizer: The rasterizer.
@@ -485,12 +490,12 @@ class Model:
 
 @dataclass(frozen=True)
 class EvaluationReport:
-    """An evaluation, for observers.
+    """The results of one evaluation, for observers.
 
     Attributes:
-        step: The step.
-        row: The new row of metrics.csv.
-        regimes: The regimes of the held-out views; `psnr_far` is the PSNR of regime `far`.
+        step: Step after which the views were evaluated. row: The new row of metrics.csv.
+        regimes: The regimes of the held-out views. For example, column `psnr_far` is the PSNR of
+            regime `far`.
     """
 
     step: int
@@ -504,14 +509,16 @@ class OperatorContext:
 
     Attributes:
         step: 1-based number of the step.
-        blocks: [B] name of each Gramian's block (`geometry`, `appearance` under granularity
-            `kind`, `all` under `global`; under `gaussian` one name for all rows of a block).
+        blocks: [B] name of the block that each Gramian belongs to. With granularity `kind`, the
+            names are kinds such as `geometry`; with `global`, the only name is `all`. With
+            `gaussian`, all Gramians of a block have the block's name.
         kinds: [B] kind of each block.
         losses: [K] float64 photometric losses.
         labels: K group labels, or None.
-        distances: [K] float64 camera distances from the mean training camera, local units.
-        reference_distance: Median of the distances of all training cameras from the mean training
-            camera.
+        distances: [K] float64 distance of each camera from the mean position of the training
+            cameras, local units.
+        reference_distance: Median distance of the training cameras from their mean position, local
+            units.
         present: [B, K] bool, views whose gradient of the block is finite and not zero. For a view
             that is False here, the row and column of the Gramian are zero, and the operator must
             return weight 0.

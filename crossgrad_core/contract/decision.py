@@ -17,8 +17,8 @@ class Decision:
         value: The value of the setting.
         because: The reason, in a few words.
         evidence: The facts or the results that support the reason.
-        override: The option that sets another value. Empty if the value is the published value; the
-            terminal does not report such decisions.
+        override: The option that sets another value. Empty if the value is the published value. The
+            terminal does not show decisions without an override.
     """
 
     setting: str

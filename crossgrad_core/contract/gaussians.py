@@ -44,9 +44,9 @@ class Gaussians:
         sh_dc: [N, 1, 3] band 0 coefficients.
         sh_rest: [N, B - 1, 3] higher bands (B = 4, 9 or 16), None at degree 0.
         sh_degree: Active degree, 0 to 3.
-        response: How a Gaussian fills a pixel.
-        dilation: Added to both diagonal entries of the 2-D covariance, px^2; None uses the dilation
-            of the rasterizer.
+        response: Formula of a Gaussian's opacity in a pixel, see `Response`.
+        dilation: Number that is added to both diagonal entries of the 2-D covariance, px^2; None
+            uses the dilation of the rasterizer.
         origin: [N] int64, the primitive of each Gaussian; None if Gaussian i is primitive i.
         slot: [N] int64, index of each Gaussian among the Gaussians of its primitive; None if every
             primitive gives one Gaussian.
@@ -123,7 +123,7 @@ class Gaussians:
 class _Whole(Gaussians):
     """Gaussians that update all rows of a tensor when the tensor is read.
 
-    Every kind of copy gives a plain `Gaussians` object whose rows are all up to date.
+    Copying or pickling gives a plain `Gaussians` object whose rows are all up to date.
     """
 
     @override
@@ -153,8 +153,9 @@ class Screen:
     The gradient fields are None before the backward pass of the render.
 
     Attributes:
-        radii: [N] int32, pixels; 0 if the Gaussian touches no pixel.
-        pixels: [N] int32, pixels in which the Gaussian was blended; None unless requested.
+        radii: [N] int32, radius on the screen in pixels; 0 if the Gaussian touches no pixel.
+        pixels: [N] int32, number of pixels in which the Gaussian was blended; None unless
+            requested.
         mean_gradient: [N, 2] gradient of the loss with respect to the projected mean, in pixel
             coordinates.
         abs_gradient: [N, 2] like `mean_gradient`, but with the absolute values summed over the
@@ -171,8 +172,8 @@ class Screen:
             The next two numbers are the sums of |x| and |y| of the gradients in pixel coordinates;
             summed over all bins they are `abs_gradient`. The last number is the number of pixels
             with a gradient that is not 0.
-        count: Function [H, W] bool -> [N] int32: in how many of the marked pixels each Gaussian was
-            blended; None unless requested. The function keeps data of the render in memory.
+        count: Function [H, W] bool -> [N] int32: the number of marked pixels in which each Gaussian
+            was blended; None unless requested. The function keeps data of the render in memory.
         rows: [R] int64, sorted; contains every Gaussian with a radius above 0. None if the
             rasterizer provides no such list.
     """

@@ -44,20 +44,20 @@ class HookSpecs:
 
     @hookspec
     def crossgrad_validate_selection(self, selection: "Selection") -> "list[str] | None":
-        """Return reasons why this selection of components cannot work; called before training.
+        """Return reasons why the selected components cannot work together; called before training.
 
         All plugins answer this hook. A single reason is enough to refuse the run.
         """
 
     @hookspec
     def crossgrad_run_start(self, run: "RunInfo") -> None:
-        """Event: the scene was read and the components were chosen; no step was taken yet."""
+        """Event: the scene was read and the components were chosen; no step has begun."""
 
     @hookspec
     def crossgrad_update_intervals(self, blocks: "tuple[Block, ...]") -> "Mapping[str, int] | None":
-        """Return tensor name -> N for tensors that learn in only one of N steps.
+        """Return tensor name -> N for tensors that are updated in only one of N steps.
 
-        All plugins answer this hook, once per run. In the steps in which such a tensor learns, its
+        All plugins answer this hook, once per run. In the steps that update such a tensor, its
         learning rate is multiplied by sqrt(N).
         """
 
@@ -67,7 +67,7 @@ class HookSpecs:
 
     @hookspec(firstresult=True)
     def crossgrad_choose_scales(self, context: "ScaleContext") -> "ScaleResult | None":
-        """Return the scale at which each drawn view is rendered and compared (resolution slot)."""
+        """Return the scale at which each drawn view is rendered for the loss (resolution slot)."""
 
     @hookspec
     def crossgrad_view_gaussians(self, context: "GaussiansContext") -> "GaussiansResult | None":
@@ -127,7 +127,7 @@ class HookSpecs:
 
     @hookspec
     def crossgrad_step_done(self, context: "AfterStepContext") -> "Answer | None":
-        """Return new states that follow the parameters after a complete step, such as an average.
+        """Return new plugin states after a complete step, such as an average of the parameters.
 
         `context.edited` is True if the set of primitives changed in this step, or if density
         control overwrote values.

@@ -1,8 +1,8 @@
 """Screen statistics of a rendered view at any scale, per Gaussian and per primitive.
 
-All values are in units of the full photo. Gradients are with respect to NDC coordinates, radii are
-divided by the longer image side, and pixel counts refer to the photo as trained. A loss is a mean
-over pixels, so its gradients need no factor for the number of pixels.
+All values are in units of the full photo. Gradients are with respect to NDC coordinates. Radii are
+divided by the longer image side. Pixel counts refer to the photo at training resolution. Gradients
+need no factor for the number of pixels, because a loss is a mean over pixels.
 """
 
 from collections.abc import Mapping, Sequence
@@ -46,8 +46,8 @@ def _of_rows(record: RenderedView, statistic: Tensor | None, rows: Tensor | None
 def directions(record: RenderedView) -> Tensor:
     """Return `Screen.directions` as [6, 5, N], with its absolute gradients converted to NDC.
 
-    The dimensions are bins, fields, Gaussians. With the Gaussians last, sums over bins are sums of
-    whole rows, which is much faster on the CPU.
+    The dimensions are bins, fields, Gaussians. With the Gaussians in the last dimension, sums over
+    bins are sums of whole rows. Sums of whole rows are much faster on the CPU.
     """
     per_pixel = _present(record.screen.directions)
     bins = per_pixel.permute(1, 2, 0).clone(memory_format=torch.contiguous_format)
@@ -85,8 +85,8 @@ def visible(record: RenderedView, rows: Tensor | None = None) -> Tensor:
 def seen(record: RenderedView) -> Tensor | None:
     """Return [S] int64 rows of the Gaussians that touched a pixel; sums need only these rows.
 
-    On a GPU, return None, which means all rows, because the host would have to wait for the number
-    of rows.
+    On a GPU, return None, which means all rows, because a list of rows would make the host wait for
+    the GPU.
     """
     radii, rows = record.screen.radii, record.screen.rows
     if not radii.is_cpu:

@@ -20,10 +20,10 @@ from crossgrad_core.contract.slots.metric import Compared, Metric
 from crossgrad_core.evaluation.result import EvaluationResult, ViewMetrics, summarised
 
 #: PSNR of identical images, in dB. The value is finite, because JSON has no infinity and the mean
-#: over views must stay finite. Different images reach it only if fewer than one value in 150,000
-#: differs, by one 8-bit step.
+#: over views must stay finite. Two different images reach this limit only if less than one value in
+#: 150,000 differs by one 8-bit step.
 PSNR_LIMIT = 100.0
-#: Number of pixels whose differences stay in the cache until they are summed.
+#: Number of pixels that are compared at once, so that their differences fit into the CPU cache.
 _AT_ONCE = 2**15
 
 
@@ -65,7 +65,7 @@ def evaluate(
 
 
 def compare(view: View, render: Tensor, points: NDArray[np.float64] | None = None) -> Compared:
-    """Return a view's photo and render [H, W, 3], rounded to 8 bits, and the points it observed."""
+    """Return the data of a view that metrics compare; the render [H, W, 3] is rounded to 8 bits."""
     photo, mask = view.photo.image(), view.photo.mask()
     seen = np.zeros((0, 3)) if points is None else points[view.seen]
     return Compared(view, to_uint8(render), photo, mask, render.detach().cpu(), seen)

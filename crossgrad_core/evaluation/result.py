@@ -1,4 +1,7 @@
-"""Results of an evaluation: metrics per view, means overall and per regime. Imports no torch."""
+"""Results of an evaluation: metrics of each view, and means overall and per regime.
+
+This module does not import torch.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -32,7 +35,7 @@ class ViewMetrics:
 
 @dataclass(frozen=True)
 class Means:
-    """Means over `views` views, fully masked views excluded; None if no view has the metric."""
+    """Mean metrics of `views` views (fully masked views excluded); None if no view has a value."""
 
     views: int
     values: Mapping[str, float | None]

@@ -76,7 +76,7 @@ class Entry:
 
 
 def offers(slot: str) -> tuple[Entry, ...]:
-    """Return all entries of installed distributions for a slot, by name; names may occur twice.
+    """Return all installed entries of a slot, sorted by name; a name may occur twice.
 
     Raises:
         KeyError: There is no such slot.
@@ -94,7 +94,7 @@ def entries(slot: str) -> dict[str, Entry]:
 
 
 def find(slot: str, name: str) -> Entry:
-    """Return the only entry of that name.
+    """Return the only entry of a slot with the name `name`.
 
     Raises:
         UserError: No distribution offers the name, or more than one does.
@@ -123,10 +123,11 @@ def load(slot: "type[C]", name: str) -> "type[C]": ...
 @overload
 def load(slot: str, name: str) -> "type[Component]": ...
 def load(slot: "str | type[Component]", name: str) -> "type[Component]":
-    """Return the class that fills a slot under a name; its module is imported first.
+    """Return the class of the component with this name; its module is imported first.
 
     Args:
-        slot: Name of the slot, or its base class; the returned class is a subclass of it.
+        slot: Name of the slot, or base class of the slot; the returned class is a subclass of this
+            base class.
         name: Name of the plugin.
 
     Raises:
@@ -190,10 +191,10 @@ def notes_on(error: BaseException) -> list[str]:
 
 
 def quick_answer(entry: Entry) -> Callable[[Any], Any] | None:
-    """Return a function that answers for a component without importing its class; or None.
+    """Return a component's quick function, which needs no import of the component; or None.
 
-    A package may announce such a function under the name of its component. The function answers
-    like `accepts` of a reader with default options, or like `speed` of a rasterizer.
+    A package may announce such a function under the name of its component. The function returns the
+    same result as `accepts` of a reader with default options, or as `speed` of a rasterizer.
 
     Raises:
         UserError: The function cannot be imported.
@@ -205,7 +206,7 @@ def quick_answer(entry: Entry) -> Callable[[Any], Any] | None:
 
 
 def failed_plugin(error: Exception) -> UserError | None:
-    """Return the error for an exception from another package; None for crossgrad's own code."""
+    """Return a user error for an exception that a plugin of another package raised; else None."""
     others = (entry for slot in OFFERED for entry in offers(slot) if entry.distribution != OURS)
     raising = [(entry, line) for entry in others if (line := raised_at(error, entry.package))]
     if not raising:
@@ -245,7 +246,8 @@ def build(slot: "str | type[Component]", name: str, options: Mapping[str, Any]) 
     """Return the component of that name with validated options.
 
     Args:
-        slot: Name of the slot, or its base class; the returned component is an instance of it.
+        slot: Name of the slot, or base class of the slot; the returned component is an instance of
+            this class.
         name: Name of the plugin.
         options: Name of an option -> value.
 
@@ -297,7 +299,7 @@ def plain(component: "Component") -> dict[str, Any]:
 
 @cache
 def _offers(path: tuple[str, ...]) -> dict[str, tuple[Entry, ...]]:  # noqa: ARG001 - cache key
-    """Return slot -> entries; the argument is `sys.path`, so that a new path is scanned again."""
+    """Return slot -> entries; the argument is `sys.path`, so a changed path causes a new scan."""
     from importlib.metadata import entry_points
 
     # Call `entry_points` once and without a filter, because each call scans every installed
@@ -321,7 +323,7 @@ def _offers(path: tuple[str, ...]) -> dict[str, tuple[Entry, ...]]:  # noqa: ARG
 
 @cache
 def _identity(distribution: "Distribution | None") -> tuple[str, str]:
-    """Return name and version; cached, because each access parses the metadata file."""
+    """Return the name and version of a distribution; cached, because each access parses a file."""
     if distribution is None:
         return "unknown", "unknown"
     metadata = distribution.metadata

@@ -24,7 +24,7 @@ def as_user_error(
         error: The error of pydantic.
         model: The validated model; its fields are the options that are suggested.
         subject: The owner of the options, for example `operator cagrad`.
-        prefix: The position of the options in a configuration, for example `operator`.
+        prefix: Key of the options in a configuration, for example `operator`.
         todo: Advice for the user.
     """
     details = error.errors(include_url=False)
@@ -55,9 +55,9 @@ def as_user_error(
 def _place(
     model: type[BaseModel], location: _Location
 ) -> tuple[tuple[str, ...], type[BaseModel] | None]:
-    """Return the place in the input that a pydantic location names, and the model that holds it.
+    """Return the keys in a pydantic location, and the model that should contain the last key.
 
-    A location also names the tried branch of a union, which users never write.
+    The keys do not include the branches of a union, because the user's input does not contain them.
     """
     parts: list[str] = []
     holder: type[BaseModel] | None = None
@@ -94,7 +94,7 @@ def _name(annotation: object) -> str:
 
 
 def _inside(annotation: object, part: str) -> tuple[type[BaseModel] | None, object]:
-    """Return `annotation` if it is a model, else None, and the annotation of `part` inside it."""
+    """Return the model `annotation`, or None for another type, and the annotation of `part`."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         field = annotation.model_fields.get(part)
         return annotation, field.annotation if field else None

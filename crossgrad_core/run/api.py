@@ -21,7 +21,7 @@ def run(
     verbose: bool = False,
     **options: object,
 ) -> Run:
-    """Train a scene, evaluate and export it, into the same folder as `crossgrad run`.
+    """Train a scene, evaluate it and export it, as `crossgrad run` does.
 
     Args:
         scene: Scene folder; the bundled example scene by default.
@@ -59,7 +59,7 @@ def resume(
     verbose: bool = False,
     **options: object,
 ) -> Run:
-    """Continue a stopped run, bit for bit.
+    """Continue a stopped run; the results are bitwise equal to an uninterrupted run.
 
     Args:
         folder: The run's folder.
@@ -85,7 +85,7 @@ def resume(
 
 @contextmanager
 def _speaking(*, quiet: bool) -> Iterator[None]:
-    """Report the stages of the start in the same way as a command."""
+    """Report the stages of the start as the command `crossgrad run` does."""
     announce(quiet=quiet)
     try:
         yield
@@ -102,7 +102,7 @@ def _say_nothing(table: str, folder: Path, words: Sequence[str]) -> None:
 
 
 def _result(outcome: app.Outcome) -> Run:
-    """Return the run, or raise the exception that corresponds to its ending."""
+    """Return the run, or raise an exception if training failed or a signal stopped the run."""
     folder, ending = outcome.folder.resolve(), outcome.ending
     if ending.status == "failed":
         raise RunFailedError(folder, ending.error or "") from ending.cause

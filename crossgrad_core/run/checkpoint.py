@@ -35,7 +35,7 @@ from crossgrad_core.wording import showable
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """The complete state from which a run continues bit for bit.
+    """The complete state of a run, from which the run continues with bitwise equal results.
 
     Attributes:
         step: Number of completed steps.
@@ -45,7 +45,7 @@ class Checkpoint:
         adam_steps: Tensor name -> number of Adam steps taken.
         plugins: Plugin name -> state of the plugin.
         generators: Stream name -> `bit_generator.state` of its NumPy generator.
-        scalars: Counters, clocks and other values that JSON can hold (tuples come back as lists).
+        scalars: Counters, clocks and other values that JSON can store (tuples become lists).
     """
 
     step: int
@@ -97,8 +97,8 @@ def named_checkpoints(folder: Path) -> dict[int, Path]:
     """Return step -> folder of the checkpoints in `folder`, in the order of steps.
 
     A checkpoint gets its final name when all of its files are written. A checkpoint with a missing
-    file is therefore damaged. Such a checkpoint is still returned, because otherwise an older
-    checkpoint would silently replace it.
+    file is therefore damaged. A damaged checkpoint is still returned, because otherwise a run would
+    silently continue from an older checkpoint.
     """
     if not folder.is_dir():
         return {}
@@ -108,7 +108,9 @@ def named_checkpoints(folder: Path) -> dict[int, Path]:
 
 
 def damaged(folder: Path, found: str) -> UserError:
-    """Return the error for a damaged checkpoint; it names another checkpoint if one exists."""
+    """Return the error for a damaged checkpoint; the error names a complete checkpoint if one
+    exists.
+    """
     named = named_checkpoints(folder.parent).values()
     others = [path for path in named if path.name != folder.name and is_complete(path)]
     return UserError(
@@ -123,7 +125,7 @@ def damaged(folder: Path, found: str) -> UserError:
 
 @contextmanager
 def scratch_folder(final: Path) -> Iterator[Path]:
-    """Yield a folder to write into; it gets the name `final` if the block ends without an error."""
+    """Yield a temporary folder, which is renamed to `final` if the block ends without an error."""
     scratch = final.with_name(f"{_SCRATCH}{final.name}")
     final.parent.mkdir(parents=True, exist_ok=True)
     _clear(final.parent)
@@ -163,20 +165,24 @@ def _clear(folder: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
 
 
-#: Version of the layout. It is raised if an older reader could misread a newer checkpoint.
+#: Version of the file layout. Increase this number if older code could misread a newer checkpoint.
 FORMAT = 1
 _DIGEST = "state_sha256"
 
 
 def state_text(state: Mapping[str, Any]) -> str:
-    """Return the content of state.json: `state`, the versions that wrote it, and a digest."""
+    """Return the content of state.json: `state`, the versions of format and crossgrad, and a
+    digest.
+    """
     rest = {key: value for key, value in state.items() if key != _DIGEST}
     whole = {"format": FORMAT, "crossgrad": VERSION, **rest}
     return json.dumps({_DIGEST: digest(whole), **whole}, indent=1)
 
 
 def digest(state: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a state without its `digest`, equal after a round trip through JSON."""
+    """Return the SHA-256 of a state without its digest; conversion to JSON and back keeps the
+    value.
+    """
     rest = {key: value for key, value in state.items() if key != _DIGEST}
     return sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
@@ -306,7 +312,7 @@ def unpack(packed: Mapping[str, Tensor]) -> Unpacked:
     """Return the tensors by owner; the inverse of `pack`.
 
     Raises:
-        ValueError: `pack` cannot have made one of the keys.
+        ValueError: A key does not have the form of the keys that `pack` writes.
     """
     tensors = Unpacked()
     for key, tensor in packed.items():
@@ -329,8 +335,8 @@ def write_tensors(path: Path, packed: dict[str, Tensor]) -> None:
     """Write a safetensors file and wait until it is on the disk.
 
     Raises:
-        OSError: The system refused, for example because the disk is full. A system error that the
-            library wraps in its own exception is also raised as OSError.
+        OSError: The file cannot be written, for example because the disk is full. A system error
+            that the library wraps in its own exception is also raised as OSError.
     """
     from safetensors import SafetensorError
     from safetensors.torch import save_file
@@ -370,7 +376,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
 
 
 def _all(checkpoint: "Checkpoint") -> Iterator[tuple[tuple[str, ...], Tensor]]:
-    """Yield every tensor of a checkpoint with the path that names it."""
+    """Yield the key of every tensor of a checkpoint, as a tuple of names, and the tensor."""
     for kind in ("parameters", "exp_avg", "exp_avg_sq"):
         tensors: Mapping[str, Tensor] = getattr(checkpoint, kind)
         for name, tensor in tensors.items():
@@ -385,8 +391,8 @@ def _all(checkpoint: "Checkpoint") -> Iterator[tuple[tuple[str, ...], Tensor]]:
 def save(run: Path, checkpoint: Checkpoint, keep: Keep | None = None) -> Path:
     """Write a checkpoint below the run's folder, then delete the checkpoints that `keep` drops.
 
-    The new checkpoint gets its final name when all of it is on the disk. Until then, and after any
-    failure, the earlier checkpoints are not changed.
+    The new checkpoint gets its final name when all its files are on the disk. Until then, and after
+    any failure, the earlier checkpoints are not changed.
 
     Args:
         run: The run's folder.
@@ -427,7 +433,7 @@ def _write(final: Path, tensors: dict[str, Tensor], state: Mapping[str, Any]) ->
 
 
 def _drop(folder: Path, keep: Keep, *coming: int) -> bool:
-    """Delete the checkpoints that `keep` drops when checkpoints of the steps `coming` exist, too.
+    """Delete the checkpoints that `keep` drops; the steps `coming` count as existing checkpoints.
 
     Return True if a checkpoint was deleted.
     """
@@ -439,10 +445,11 @@ def _drop(folder: Path, keep: Keep, *coming: int) -> bool:
 
 
 def load_latest(run: Path) -> Checkpoint:
-    """Read the newest checkpoint of a run, even if the run deletes old checkpoints meanwhile.
+    """Read the newest checkpoint of a run, even if the run deletes old checkpoints at the same
+    time.
 
     Raises:
-        UserError: There is no checkpoint, or it is damaged.
+        UserError: There is no checkpoint, or the newest checkpoint is damaged.
     """
     while True:
         folder = latest(run)

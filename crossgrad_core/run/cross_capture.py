@@ -16,18 +16,18 @@ from crossgrad_core.numerics.rotations import rotation_matrices
 from crossgrad_core.run.assemble import accepts, read_scene
 from crossgrad_core.training.setup import Setup
 
-#: A view counts as a training view if its pose is nearer to a training pose than these limits:
-#: local units (extents), and radians.
+#: Largest differences in position (local units) and in direction (radians) between a view and a
+#: training view. A view within both limits counts as this training view.
 SAME_PLACE, SAME_DIRECTION = 1e-3, 1e-2
-#: A capture is accepted if at least the first value, a share of its points, is inside a box. The
-#: box contains the run's points and cameras and is enlarged by the second value, a factor.
+#: Smallest share of a capture's points inside a box, and the factor that enlarges the box. The box
+#: contains the run's points and cameras.
 LEAST_SHARED, MARGIN = 0.1, 1.1
-#: Points of two captures of one place are on the same surfaces. Their median distance from the
-#: run's points is at most this share of the median after any of `TURNS` random rotations about the
-#: middle of the capture.
+#: Largest ratio of two median distances, and number of random rotations. The points of two captures
+#: of one place are on the same surfaces. Therefore the capture's points are much nearer to the
+#: run's points than after a random rotation about the middle of the capture.
 LEAST_ALIKE, TURNS = 0.4, 9
-#: Minimum number of points for this test, maximum number of points from the other capture, and
-#: maximum number of points from the run.
+#: Minimum number of points for the test with random rotations, maximum number of points from the
+#: other capture, and maximum number of points from the run.
 FEWEST_POINTS, MOST_POINTS, MOST_OWN = 200, 2_000, 50_000
 
 
@@ -40,7 +40,8 @@ class Elsewhere:
         views: The views of the capture, except the views that the run was trained on.
         points: [P, 3] the SfM points of the capture.
         trained: Number of views of the capture that the run was trained on.
-        alike: True if the points are near the run's points, or if this is unknown.
+        alike: True if the points match the run's points, or if there are too few points for a
+            decision.
     """
 
     name: str
@@ -136,7 +137,7 @@ def _rotations_of(views: Sequence[View]) -> NDArray[np.float64]:
 def _check_place(
     scene: Scene, points: NDArray[np.float64], centers: NDArray[np.float64], path: Path
 ) -> None:
-    """Refuse a capture in other coordinates: its points are not where the run's scene is."""
+    """Refuse a capture whose points are outside the run's scene, because its coordinates differ."""
     scene_points = np.concatenate([scene.points, scene.robust_centers])
     middle, half = (
         (scene_points.max(axis=0) + scene_points.min(axis=0)) / 2,
@@ -155,7 +156,7 @@ def _check_place(
 
 
 def _alike(run_points: NDArray[np.float64], points: NDArray[np.float64]) -> bool:
-    """Return True if `points` are near the run's points, and would not be after a rotation.
+    """Return True if `points` match the run's points better than after a random rotation.
 
     Also return True if there are too few points for a decision.
     """
@@ -183,5 +184,5 @@ def _alike(run_points: NDArray[np.float64], points: NDArray[np.float64]) -> bool
 
 
 def _some(points: NDArray[np.float64], most: int) -> NDArray[np.float64]:
-    """Return at most `most` points, evenly spread over their order."""
+    """Return at most `most` points: every n-th point."""
     return points[:: -(-len(points) // most)]

@@ -37,8 +37,8 @@ class Initializer(Component):
     An initializer is used only in runs that start from the scene's own points (`--init points`).
 
     Attributes:
-        alone: True if the initializer can make points for a scene without points. An initializer
-            raises an error if it finds no points in such a scene.
+        alone: True if the initializer can make points for a scene without points. In a scene
+            without points, the initializer must then make points or raise an error.
     """
 
     slot: ClassVar[str] = "initializers"

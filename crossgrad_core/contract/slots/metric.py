@@ -21,7 +21,7 @@ class Compared:
 
     Attributes:
         view: The view.
-        render: [H, W, 3] uint8 on the CPU, rounded as if it had been written to a file.
+        render: [H, W, 3] uint8 on the CPU, rounded as in an image file.
         photo: [H, W, 3] uint8.
         mask: [H, W] bool, True where the pixel counts; None if every pixel counts.
         drawn: [H, W, 3] floating point on the CPU, the render before clamping and rounding; None if

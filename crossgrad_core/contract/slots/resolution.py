@@ -51,9 +51,9 @@ class Resolution(Component):
         return ()
 
     def pixels(self, schedule: Schedule, step: int) -> float:
-        """Return the pixels that all steps up to this step render, in numbers of full photos.
+        """Return the number of pixels rendered until the end of a step, in units of one full photo.
 
-        Time budgets use this number for planning. By default all views have their full size.
+        Time budgets use this number for planning. By default all views are rendered at full size.
         """
         return schedule.pace.views(step)
 
@@ -68,7 +68,7 @@ class Resolution(Component):
 
     @hookimpl
     def crossgrad_choose_scales(self, context: ScaleContext) -> ScaleResult:
-        """Implement the hook with the scales of this resolution."""
+        """Return this resolution's result for the hook."""
         answer = self.scales(context, context.state(STATE))
         scales, state = with_state(answer, Sequence, self, "scales")
         return ScaleResult(tuple(scales), states={STATE: state})
