@@ -336,7 +336,7 @@ class Schedule:
         return self.step_of(self.next_edit(0))
 
     def next_edit(self, count: int) -> int:
-        """Return the count of the first edit after `count`; it may be after the last planned edit."""
+        """Return the count of the first edit after `count`, even after the last planned edit."""
         # If steps are counted, edits are at multiples of the interval, as published.
         every, origin = self.densify_every, 0
         if self.counting.unit == "views":

@@ -108,9 +108,7 @@ def named_checkpoints(folder: Path) -> dict[int, Path]:
 
 
 def damaged(folder: Path, found: str) -> UserError:
-    """Return the error for a damaged checkpoint; the error names a complete checkpoint if one
-    exists.
-    """
+    """Return the error for a damaged checkpoint; the error names a complete one if possible."""
     named = named_checkpoints(folder.parent).values()
     others = [path for path in named if path.name != folder.name and is_complete(path)]
     return UserError(
@@ -171,18 +169,14 @@ _DIGEST = "state_sha256"
 
 
 def state_text(state: Mapping[str, Any]) -> str:
-    """Return the content of state.json: `state`, the versions of format and crossgrad, and a
-    digest.
-    """
+    """Return the content of state.json: `state`, the format, the version and a digest."""
     rest = {key: value for key, value in state.items() if key != _DIGEST}
     whole = {"format": FORMAT, "crossgrad": VERSION, **rest}
     return json.dumps({_DIGEST: digest(whole), **whole}, indent=1)
 
 
 def digest(state: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a state without its digest; conversion to JSON and back keeps the
-    value.
-    """
+    """Return the SHA-256 of a state without its digest; the state may come from a JSON file."""
     rest = {key: value for key, value in state.items() if key != _DIGEST}
     return sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
@@ -445,8 +439,7 @@ def _drop(folder: Path, keep: Keep, *coming: int) -> bool:
 
 
 def load_latest(run: Path) -> Checkpoint:
-    """Read the newest checkpoint of a run, even if the run deletes old checkpoints at the same
-    time.
+    """Read the newest checkpoint of a run, even if the run deletes checkpoints during the call.
 
     Raises:
         UserError: There is no checkpoint, or the newest checkpoint is damaged.

@@ -56,7 +56,7 @@ class Operator(Component):
         return views == 1 and self.identity_at_one
 
     def needs_more_views(self, views: int) -> bool:
-        """Return True if the operator, or an operator inside it, has no effect with `views` views."""
+        """Return True if the operator, or an operator in it, has no effect with `views` views."""
         return self.is_identity(views)
 
     def reads_labels(self) -> bool:

@@ -1,4 +1,4 @@
-"""Files of a run that its checkpoints also store, so that damage is detected or repaired."""
+"""Copies of files of a run in its checkpoints, with which damage is detected or repaired."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -30,7 +30,7 @@ def kept_files(folder: Path) -> dict[str, Json]:
 
 
 def restored(folder: Path, scalars: Mapping[str, Any], step: int) -> tuple[str, ...]:
-    """Restore metrics.csv as it was at a checkpoint; rows that were added later are removed.
+    """Restore metrics.csv as it was at a checkpoint; later rows are removed.
 
     Args:
         folder: The run's folder.
@@ -52,7 +52,7 @@ def restored(folder: Path, scalars: Mapping[str, Any], step: int) -> tuple[str, 
 
 
 def edited(folder: Path, scalars: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return a note if config.yaml differs from its content when the checkpoint was written."""
+    """Return a note if config.yaml has changed since the checkpoint was written."""
     text = (scalars.get(KEY) or {}).get(CONFIG)
     if text is None:
         return ()

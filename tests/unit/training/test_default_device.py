@@ -66,7 +66,7 @@ def test_a_gpu_is_selected_if_a_rasterizer_works_and_the_trial_runs_once(on_a_gp
         device, notes = device_of()
     assert device == "cuda"
     assert notes == (
-        f"device cuda: rasterizer gswarp works on {GPU} (use --device cpu to avoid it)",
+        f"device cuda: rasterizer gswarp works on {GPU} (use --device cpu to avoid the GPU)",
     )
     assert tried.devices == ["cuda"]
     assert "testing rasterizer gswarp on the GPU" in caplog.text
