@@ -1,4 +1,4 @@
-"""The configuration of a run: one schema for command line, file and results."""
+"""The configuration of a run: the class `RunConfig` for command line, files and results."""
 
 from collections.abc import Container, Mapping
 from pathlib import Path
@@ -21,10 +21,10 @@ from crossgrad_core.contract.schedule import ScheduleMode, Unit, ViewsPerStepSpe
 
 #: Value of a setting that the run chooses at its start.
 AUTO: Final = "auto"
-#: Settings of a run that do not change its training.
+#: Settings that may change when a run is resumed, because they do not affect the training.
 CHANGEABLE: Final = frozenset({"device", "threads", "stop_after"})
-#: How the number of primitives grows: as the densifier requests, or by a budget for the length of
-#: the run.
+#: Rule for the growth of the number of primitives: as the densifier requests, or by a budget that
+#: depends on the length of the run.
 Growth: TypeAlias = Literal["unbounded", "budget"]
 
 
@@ -33,7 +33,7 @@ _RENAMED: Final = {"views": "views_per_step"}
 
 
 def current_name(setting: str, beside: Container[str] = ()) -> str:
-    """Return the present name of a setting; keep the old name if `beside` has the present name."""
+    """Return the present name of a setting; keep an old name if `beside` contains the new name."""
     new = _RENAMED.get(setting, setting)
     return setting if new in beside else new
 
@@ -61,7 +61,7 @@ class ComponentChoice(BaseModel):
 class RunConfig(BaseModel):
     """All settings that determine a run.
 
-    `None` leaves a setting to the recipe; the recipe's decision is written to config.yaml.
+    The recipe decides settings that are None, and the decisions are written to config.yaml.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -148,7 +148,7 @@ class RunConfig(BaseModel):
     steps: Annotated[int | None, Flag("N", TRAINING, common=True)] = Field(
         None,
         ge=1,
-        description="Number of optimizer steps; schedules scale with it. Default: 30000.",
+        description="Number of optimizer steps; schedules scale with this number. Default: 30000.",
     )
     max_views: Annotated[int | None, Flag("N", TRAINING)] = Field(
         None,
@@ -166,16 +166,17 @@ class RunConfig(BaseModel):
     )
     revisions: tuple[tuple[PositiveInt, PositiveInt], ...] = Field(
         (),
-        description="(step, planned number of steps from that step on) of a run with a time budget",
+        description="pairs (step, number of steps planned after this step) of a run with a time "
+        "budget",
     )
     revised: tuple[dict[str, int | float | str], ...] = Field(
-        (), description="settings that changed with each of these plans"
+        (), description="settings that changed with each entry of revisions"
     )
     planned_seconds: float | None = Field(
         None, gt=0, description="seconds of a run with a time budget"
     )
     planned_views: int | None = Field(
-        None, ge=1, description="maximum number of views within these seconds"
+        None, ge=1, description="maximum number of views of a run with a time budget"
     )
     seed: Annotated[int, Flag("N", TRAINING, common=True)] = Field(
         0, ge=0, description="Seed of all random numbers. Default: 0."
@@ -208,7 +209,7 @@ class RunConfig(BaseModel):
         None,
         ge=0,
         description="minimum number of edits; short runs start earlier and edit more often to "
-        "reach it",
+        "reach this number",
     )
     reset_every: int | None = Field(
         None,
@@ -246,7 +247,7 @@ class RunConfig(BaseModel):
         "passes over the photos are used",
     )
     few_pass_rates: bool | None = Field(
-        None, description="blocks that use the learning rates for few passes over the photos"
+        None, description="true: use the learning rates for few passes over the photos"
     )
     step_order: Literal["optimize-first", "densify-first"] | None = Field(
         None,
@@ -361,7 +362,7 @@ class RunConfig(BaseModel):
     @field_validator("decided")
     @classmethod
     def _are_settings(cls, value: dict[str, str]) -> dict[str, str]:
-        """Refuse a reason for something that is not a setting."""
+        """Refuse names in `decided` that are not settings."""
         for name in value:
             setting, _, option = name.partition(".")
             options = SceneOptions.model_fields if setting == "data" else {option}
@@ -400,7 +401,7 @@ class RunConfig(BaseModel):
 
     @property
     def view_plan(self) -> ViewsPerStepSpec | None:
-        """The number of views of every step; None if the sampler decides it."""
+        """The number of views of every step; None if the sampler decides the number."""
         return (
             None
             if self.views_per_step is None

@@ -493,7 +493,8 @@ class EvaluationReport:
     """The results of one evaluation, for observers.
 
     Attributes:
-        step: Step after which the views were evaluated. row: The new row of metrics.csv.
+        step: Step after which the views were evaluated.
+        row: The new row of metrics.csv.
         regimes: The regimes of the held-out views. For example, column `psnr_far` is the PSNR of
             regime `far`.
     """

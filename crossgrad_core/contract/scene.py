@@ -268,8 +268,8 @@ class View:
 
     Attributes:
         name: Path relative to the image folder with forward slashes.
-        camera: The camera, for the photo at training resolution. photo: The photo, decoded on
-        request.
+        camera: The camera, for the photo at training resolution.
+        photo: The photo, decoded on request.
         regime: Label of the camera group under which results are reported.
         seen: [S] int64 indices of the SfM points that this view observed; may be empty.
     """

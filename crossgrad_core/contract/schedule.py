@@ -202,8 +202,9 @@ class Schedule:
         sh_from: SH degree at the first step.
         sh_wait: The SH degree does not grow before this count.
         counting: The unit of the counts.
-        pace: Number of views K of every step. edits_before: Number of edits before `densify_from`
-        in a run whose length a time budget changed.
+        pace: Number of views K of every step.
+        edits_before: Number of edits before `densify_from` in a run whose length a time budget
+            changed.
         min_refinements: Minimum number of edits of the run, also after a change of its length, if
             the run is long enough.
     """

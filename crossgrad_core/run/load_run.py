@@ -90,7 +90,7 @@ _TIMED: Final = "time budget"
 
 
 def settings_of(config: RunConfig) -> dict[str, Json]:
-    """Return the version and the settings that affect training, as flat keys (`loss.ssim_weight`)."""
+    """Return the version and the settings that affect training, such as `loss.ssim_weight`."""
     loose = set(_LOOSE)
     if config.planned_seconds is None:
         loose -= {"revisions"}

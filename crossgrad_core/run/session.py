@@ -141,7 +141,7 @@ class Session:
             )
 
     def rewind(self, setup: Setup, step: int) -> None:
-        """Delete rows and checkpoints after `step`, because training was rolled back to this step."""
+        """Delete rows and checkpoints after `step`, to which training was rolled back."""
         self._table = MetricsCsv.resume(self.folder, columns_of(setup), step)
         drop_later(self.folder, step)
         self._saved_step = self._evaluated_step = -1

@@ -1,6 +1,6 @@
-"""Refusal of settings that would change nothing in a new run, with the reason and a remedy.
+"""Checks that refuse settings without an effect on a new run, with the reason and a remedy.
 
-A resumed run is not checked: its settings were accepted when it began.
+A resumed run is not checked, because its settings were accepted at its start.
 """
 
 from collections.abc import Iterator
@@ -44,7 +44,7 @@ def refuse_settings_for_nothing(config: RunConfig, setup: Setup) -> None:
     """Refuse settings of the user that have no effect in this run.
 
     Args:
-        config: The settings of the user, before any decision.
+        config: The settings of the user, without the recipe's decisions.
         setup: The assembled run.
 
     Raises:
@@ -77,7 +77,7 @@ def _of_components(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]
         yield from _of_choice(slot, slot, getattr(config, slot), setup)
     links = config.operators
     for link in links:
-        # Options of an operator in a chain are set by the name of the operator.
+        # In a chain, the key of an operator's option contains the name of the operator.
         setting = "operator" if len(links) == 1 else f"operator.{link.name}"
         yield from _of_choice("operator", setting, link, setup)
 
@@ -88,8 +88,8 @@ def _of_choice(
     if choice is None or not choice.options:
         return
     name = setup.selection.names[slot] if choice.name == AUTO else choice.name
-    # Use the options as the user set them: a component that was fitted to the scene may have lost
-    # unneeded options.
+    # Build the component with the user's options, because the component of the run was fitted to
+    # the scene and may lack some of these options.
     component = build(plural(slot), name, choice.options)
     for option, why in set_for_nothing(component, setup.selection).items():
         yield f"{setting}.{option}", why
@@ -118,7 +118,7 @@ def _of_resets(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
             "reset_every",
             f"densifier {setup.selection.names['densifier']} makes no opacity resets",
         )
-    # A run with a time budget reports this as a note as soon as its length is known.
+    # A run with a time budget reports options without effect as a note when its length is planned.
     if not (config.seconds or config.planned_seconds):
         yield from without_resets(config, setup)
 
@@ -135,7 +135,7 @@ def without_resets(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]
 
 
 def _of_views(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
-    """Yield the settings on the views of a step that have no effect."""
+    """Yield settings about the views of a step that have no effect, with reasons."""
     densifier, name = setup.densifier, setup.selection.names["densifier"]
     one = setup.selection.views_per_step == 1
     if config.densify_views != "all" and not (densifier.edits and densifier.observes):

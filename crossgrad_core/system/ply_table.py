@@ -45,7 +45,7 @@ _MOST_HEADER_LINES = 10_000
 
 @dataclass(frozen=True)
 class Element:
-    """A kind of record of a PLY file; `fields` is None if it has list properties."""
+    """An element of a PLY file; `fields` is None if the element has list properties."""
 
     name: str
     count: int
@@ -77,7 +77,7 @@ class Header:
 
 @dataclass(frozen=True, eq=False)
 class Vertices:
-    """Property name -> [N] column in the file's own type, and the comments of the header."""
+    """The vertices of a PLY file: property name -> [N] column in the file's type, and comments."""
 
     columns: Mapping[str, NDArray[np.generic]]
     comments: tuple[str, ...]

@@ -18,9 +18,10 @@ class Totals:
     """The cost of a run up to an evaluation.
 
     Attributes:
-        step: Number of optimizer steps. views: Number of rendered training views. backward_passes:
-        Number of backward passes. train_seconds: Training seconds without compiling, loading,
-        evaluating and reporting.
+        step: Number of optimizer steps.
+        views: Number of rendered training views.
+        backward_passes: Number of backward passes.
+        train_seconds: Training seconds without compiling, loading, evaluating and reporting.
         primitives: Number of primitives.
         peak_memory_mib: Peak memory, MiB; None if the system does not report it.
         loss: Mean photometric loss of the last step; None before the first step.

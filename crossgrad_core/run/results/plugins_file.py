@@ -66,7 +66,7 @@ def write_plugins(folder: Path, packages: Packages) -> None:
 
 
 def read_plugins(folder: Path, *, quiet: bool = False) -> Packages | None:
-    """Return the packages that trained a run; if they are unknown, log a warning and return None."""
+    """Return the packages that trained a run; if unknown, return None and log a warning."""
     path = folder / FILE
     try:
         return _PACKAGES.validate_json(read_file(path))

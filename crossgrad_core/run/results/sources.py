@@ -21,8 +21,8 @@ def name_for(folder: Path, name: str, source: Path) -> str:
 
     Args:
         folder: The run's folder, which stores the names.
-        name: Name of the scene or camera path. source: Path of the scene or of the camera path's
-        file.
+        name: Name of the scene or camera path.
+        source: Path of the scene or of the camera path's file.
 
     Raises:
         UserError: The disk is full.

@@ -219,7 +219,7 @@ def _number(value: float | None, form: str) -> str:
 
 
 def _shown(result: EvaluationResult) -> list[tuple[str, str]]:
-    """Return pairs (name, reason) of missing metrics, only for metrics that have values by regime."""
+    """Return pairs (name, reason) of missing metrics; omit metrics without values by regime."""
     reported_by_regime = [figure.name for figure in result.figures if figure.per_regime]
     return [(name, why) for name, why in result.reasons.items() if name in reported_by_regime]
 
