@@ -356,7 +356,7 @@ def resolved(setup: "Setup") -> dict[str, Any]:
 
 
 def available_cores() -> tuple[int, ...]:
-    """Return the cores that this process may use; the CPU quota of a container limits their number."""
+    """Return the cores that this process may use; a container's CPU quota limits their number."""
     import os
 
     from crossgrad_core.system import cores

@@ -1,4 +1,4 @@
-"""Settings of a run from a file, from options and from `--set`, in this order of priority.
+"""Settings of a run from a file, options and `--set`; each source overrides the previous one.
 
 The result is a nested dictionary in the shape of `crossgrad_core.config.RunConfig`. The class
 `RunConfig` validates this dictionary and reports unknown keys and invalid values.

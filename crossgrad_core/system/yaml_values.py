@@ -145,7 +145,7 @@ def read_mapping(path: Path, what: str, todo: str) -> dict[str, Any]:
 
 
 def described(error: yaml.YAMLError) -> str:
-    """Return a message of one line about an error in a YAML text, with the position of the error."""
+    """Return one line about an error in a YAML text, with the position of the error."""
     if not isinstance(error, yaml.MarkedYAMLError):
         return " ".join(str(error).split())
     text = ", ".join(phrase for phrase in (error.context, error.problem) if phrase)
