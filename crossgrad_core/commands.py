@@ -190,8 +190,8 @@ __all__ = [
 
 #: Exit code of a command whose training failed.
 FAILED: Final = 1
-#: Name that is imported at its first access -> its module. If the name in the module is different,
-#: the module's name and a colon precede the other name.
+#: Name that is imported at its first access -> its module. If the name in the module differs, the
+#: value is `module:name`.
 _LATE: Final = {
     "ComponentChoice": "config",
     "DEFAULT_STEPS": "run.decisions",

@@ -16,7 +16,7 @@ class UserError(Exception):
 
     Args:
         what: The problem, as a sentence without a full stop.
-        where: The file, option or plugin concerned.
+        where: The file, option or plugin that the problem concerns.
         expected: The value that would have been correct.
         found: The value that was found instead.
         todo: The next step for the user.

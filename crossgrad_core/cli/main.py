@@ -31,7 +31,7 @@ INTERRUPTED = 130
 
 
 class WithPlugins(TyperGroup):
-    """The core's commands, followed by the commands of installed plugins.
+    """A group of the core's commands and of the commands of installed plugins.
 
     The group searches the plugin packages only if the core does not contain the command. A plugin
     cannot replace a command of the core.

@@ -84,8 +84,8 @@ def _own(
     return _parameter(name, kind, info, default=False if kind is bool else None)
 
 
-#: Options that are not settings. The help shows them before the settings, after the first setting
-#: that concerns results, or last.
+#: Options that are not settings. In the help, these options are before the settings, after the
+#: first setting about results, or at the end.
 _FRONT: Final = (
     _own(
         "config",

@@ -57,7 +57,7 @@ def _occupy() -> None:
 def _lasting(stream: TextIO | None) -> TextIO:
     """Return a stream that writes to the same file and ignores failed writes.
 
-    Streams of other kinds (a Windows console) are returned unchanged.
+    Other kinds of streams, such as a Windows console, are returned unchanged.
     """
     if stream is None:
         return open(os.devnull, "w", encoding="utf-8")

@@ -236,7 +236,7 @@ class Edit:
 
     @property
     def keeps_rows(self) -> bool:
-        """True if all primitives stay and no row is fresh."""
+        """True if the edit keeps all primitives in their rows and marks no row as fresh."""
         return self.source is None and self.fresh is None
 
 

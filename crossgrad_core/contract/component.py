@@ -49,7 +49,7 @@ def answered(answer: object, kind: type[A], component: Component, method: str) -
 def pair(
     answer: object, first: type[A], second: type[B], component: Component, method: str
 ) -> tuple[A, B]:
-    """Return the two parts of the result of a component's method.
+    """Return the pair that a component's method returned, after a check of both types.
 
     Raises:
         UserError: The result is not a pair of these types. The message names the method.
@@ -86,7 +86,7 @@ class ViewCounts:
 
     Attributes:
         minimum: Smallest K.
-        maximum: Largest K; None for any.
+        maximum: Largest K; None for no limit.
         multiple_of: K must be a multiple of this number.
     """
 

@@ -79,8 +79,7 @@ class ViewRecord(RenderedView):
 
     Attributes:
         index: Position in `scene.train_views`.
-        label: Group label of the view, or None.
-        loss: Photometric loss of this view.
+        label: Group label of the view; None without groups. loss: Photometric loss of this view.
         background: [3] RGB background of the render.
     """
 
@@ -100,14 +99,13 @@ class StepRecord:
         step: 1-based number of the step.
         views: Positions in `scene.train_views`.
         names: Names of the views.
-        labels: Group labels of the views, or None.
+        labels: Group labels of the views; None without groups.
         losses: Photometric losses of the views, in the order of `views`.
         primitives: Number of primitives after the step.
         counts: Event -> number. The aggregation counts blocks: `zero`, `disjoint`, `dropped`,
             `conflict`. The densification counts primitives: `cloned`, `split`, `pruned`, `reset`.
         train_seconds: Training seconds since the start of the run, this step included.
-        scales: The scales at which the views were rendered and compared; empty if all views had
-            their full size.
+        scales: The scales at which the views were rendered; empty if all views had their full size.
     """
 
     step: int
@@ -194,7 +192,7 @@ class StepContext:
         step: 1-based number of the step.
         schedule: The schedule of the run.
         scene: The scene.
-        states: State of every plugin by the plugin's name; read only.
+        states: Plugin name -> state of the plugin; read only.
         rng: The random generator of the hook. Every random number of a plugin must come from this
             generator.
         photo: Returns the photo and the mask of a view on the run's device. The decoding time then
@@ -210,7 +208,7 @@ class StepContext:
     photo: PhotoOf = field(default=decoded, kw_only=True)
 
     def state(self, plugin: str) -> PluginState:
-        """Return the state that the plugin of this name returned last; empty at first."""
+        """Return the last state of the plugin with this name; empty before its first state."""
         return self.states.get(plugin, EMPTY_STATE)
 
 
@@ -219,7 +217,7 @@ class SampleContext(StepContext):
     """The context of `crossgrad_sample_views`.
 
     Attributes:
-        views_per_step: K of this step.
+        views_per_step: Number of views of this step, K.
         groups: Label of each training view, or None if the run has no grouping.
         centers: [N, 3] float64 camera centres of the training views, local frame.
         last: Record of the previous step; None in the first step.
@@ -279,12 +277,12 @@ class AggregateContext(StepContext):
         gradients: The gradients of the K views; separate if the operator or a plugin requires
             separate gradients.
         losses: [K] float64 photometric losses.
-        labels: K group labels, or None.
+        labels: K group labels; None without groups.
         distances: [K] float64 distance of each camera from the mean position of the training
             cameras, local units.
         reference_distance: Median distance of the training cameras from their mean position, local
             units.
-        blocks: The blocks, in the order of every Gramian's first dimension.
+        blocks: The blocks, in the order of the first dimension of arrays such as [B, K, K].
         scales: K scales at which losses and gradients were computed; empty if all are 1.
     """
 
@@ -317,7 +315,7 @@ class RegularizeContext(StepContext):
     """The context of `crossgrad_regularize`.
 
     Attributes:
-        parameters: The parameters, requiring gradients.
+        parameters: The parameters, which require gradients.
         backbone: The backbone.
         gaussians: The Gaussians that the backbone decoded for this view, with their autograd graph;
             None if the hook is called for the whole step.
@@ -335,15 +333,15 @@ class DensifyContext(StepContext):
     """The context of `crossgrad_densify`, which is called after every step.
 
     Attributes:
-        parameters: The parameters. Only the returned edit may change them.
+        parameters: The parameters. Only the returned edit may change the parameters.
         backbone: The backbone.
         rasterizer: The rasterizer, for statistics of views that this step did not render.
         views: The rendered views of the step with their screen statistics.
         share: Number of `views` divided by the number of all views of the step; it is 1 unless
             `--densify-views` changes it.
         means_lr: Current learning rate of the primitives' positions.
-        room: How many primitives may still be added (`--max-gaussians`, memory guard).
-        may_grow: [P] bool, the primitives that may grow; None if all may grow.
+        room: Number of primitives that may still be added (`--max-gaussians`, memory guard).
+        may_grow: [P] bool, True for primitives that may be cloned or split; None if all may.
         render: Renders a training view that the densifier chooses. The render counts as training
             time and as a rendered view.
     """
@@ -364,7 +362,7 @@ class AfterStepContext(StepContext):
     """The context of the hooks `crossgrad_after_optimizer`, `_after_step` and `_step_done`.
 
     Attributes:
-        parameters: The parameters. Only the returned edit may change them.
+        parameters: The parameters. Only the returned edit may change the parameters.
         backbone: The backbone.
         means_lr: Current learning rate of the primitives' positions.
         edited: True if density control has already changed the set of primitives in this step.
@@ -383,7 +381,7 @@ class Answer:
     states: Mapping[str, PluginState] = field(default_factory=dict, kw_only=True)
 
     def with_state(self, plugin: str, state: PluginState) -> Self:
-        """Return the same result with a new state for the plugin of this name."""
+        """Return this result with a new state of the plugin with this name."""
         return replace(self, states={**self.states, plugin: state})
 
 
@@ -407,7 +405,7 @@ class AggregateResult(Answer):
 
     Attributes:
         gradients: Tensor name -> gradient; None if the optimizer must skip the tensor.
-        counts: Counted events of this step.
+        counts: Event -> number of occurrences in this step.
     """
 
     gradients: Mapping[str, Tensor | None]
@@ -455,7 +453,7 @@ class RunInfo:
 class Model:
     """The model between two steps, for plugins that measure it.
 
-    Plugins must not change any of its contents.
+    Plugins must not change this object or its tensors.
 
     Attributes:
         phase: The phase that the backbone needs to decode the Gaussians; `phase.step` is the last
@@ -465,10 +463,10 @@ class Model:
         rasterizer: The rasterizer.
         parameters: The parameters.
         adam: The optimizer's moments.
-        rule: The averaging rule of Adam in the next step.
+        rule: The hyperparameters of Adam's moments in the next step.
         background: [3] RGB background of evaluated views.
         loss: The photometric loss.
-        groups: Group label of each training view, or None.
+        groups: Group label of each training view; None without groups.
         exposed: Applies the run's exposure to a render [H, W, 3] of a view, before the loss.
         render: Renders a training view that the observer chooses. The render counts neither as
             training time nor as a rendered view.
@@ -515,21 +513,21 @@ class OperatorContext:
             `gaussian`, all Gramians of a block have the block's name.
         kinds: [B] kind of each block.
         losses: [K] float64 photometric losses.
-        labels: K group labels, or None.
+        labels: K group labels; None without groups.
         distances: [K] float64 distance of each camera from the mean position of the training
             cameras, local units.
         reference_distance: Median distance of the training cameras from their mean position, local
             units.
         present: [B, K] bool, views whose gradient of the block is finite and not zero. For a view
-            that is False here, the row and column of the Gramian are zero, and the operator must
+            with the value False, the row and column of the Gramian are zero, and the operator must
             return weight 0.
         unit: Unit roundoff of the gradients' type. Results need not be more accurate than the unit
             roundoff.
         rounding_residuals: Computes [B, K, K], the parts of the Gramians that rounding to float64
             removed. The sum of Gramian and residual has twice as many correct digits. The
-            computation needs another, slower pass over the gradients. Use it only for Gramians that
-            are almost singular, because rounding then affects the result. None if no residuals can
-            be computed.
+            computation needs another, slower pass over the gradients. Use the residuals only for
+            Gramians that are almost singular, because rounding then affects the result. None if no
+            residuals can be computed.
         scales: K scales at which losses and gradients were computed; empty if all are 1.
     """
 

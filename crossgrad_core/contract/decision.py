@@ -34,8 +34,8 @@ class Length:
 
     Attributes:
         planned: Planned number of steps.
-        total: Present number of steps. It differs from `planned` if a time budget made the run
-            longer or shorter.
+        total: Present number of steps. The number differs from `planned` if a time budget made the
+            run longer or shorter.
         start: Number of primitives at the start; None before they are counted.
     """
 

@@ -1,6 +1,6 @@
 """The description of a metric in the results: its name and its format.
 
-This module imports no large package.
+This module imports no large package, so that results can be read without torch.
 """
 
 from dataclasses import dataclass

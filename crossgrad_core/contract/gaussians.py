@@ -43,7 +43,7 @@ class Gaussians:
         colors: [N, 3] RGB.
         sh_dc: [N, 1, 3] band 0 coefficients.
         sh_rest: [N, B - 1, 3] higher bands (B = 4, 9 or 16), None at degree 0.
-        sh_degree: Active degree, 0 to 3.
+        sh_degree: Active degree of the spherical harmonics, 0 to 3.
         response: Formula of a Gaussian's opacity in a pixel, see `Response`.
         dilation: Number that is added to both diagonal entries of the 2-D covariance, px^2; None
             uses the dilation of the rasterizer.
@@ -90,7 +90,7 @@ class Gaussians:
         return self.mapped(torch.Tensor.detach)
 
     def misfit(self) -> str | None:
-        """Return the first mismatch, such as `colors is [5, 1], not [5, 3]`; None if all fit."""
+        """Return the first mismatch, such as `colors is [5, 1], not [5, 3]`; None if all are right."""
         if (self.colors is None) == (self.sh_dc is None):
             return "either colors or sh_dc must be given, not both or neither"
         number, rest, degree = len(self), self.sh_rest, self.sh_degree

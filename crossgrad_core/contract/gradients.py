@@ -53,8 +53,8 @@ class Gradients(ABC):
         The sum is bitwise equal to the gradient that the backward passes would accumulate.
 
         Args:
-            divisor: Number by which the sums are divided, without a further pass over the data. If
-                it is K, the result is the mean.
+            divisor: Number by which the sums are divided, without a further pass over the data. The
+                divisor K gives the mean.
 
         Returns:
             Tensor name -> sum; None for tensors that no view touches, or whose views are all

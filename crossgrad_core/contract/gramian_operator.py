@@ -23,7 +23,7 @@ _NARROW: Final = 1e-12
 
 
 class MatrixOperator(Operator):
-    """An operator that replaces the K gradients G of each block by M G and adds the rows of M G.
+    """An operator that multiplies a block's K gradients G by a matrix M and adds the rows of M G.
 
     Such an operator can be used in a chain of operators and for single blocks.
     """
@@ -62,9 +62,8 @@ class GramianOperator(MatrixOperator):
     """An operator whose matrices depend on the Gramians.
 
     Attributes:
-        granularity: The parts of the gradient that share one Gramian: each block, all geometry
-            blocks and all appearance blocks, all blocks together, or each Gaussian's row of a
-            block.
+        granularity: The extent of one Gramian: a block (`block`), all blocks of a kind (`kind`),
+            all blocks (`global`), or one Gaussian's row of a block (`gaussian`).
     """
 
     sparse_rows: ClassVar[bool] = True
@@ -129,8 +128,8 @@ def aggregate_by_gramians(
 ) -> tuple[AggregateResult, PluginState]:
     """Aggregate gradients with the matrices of an operator.
 
-    This takes one pass for the Gramians of all blocks, one small solve, and one pass for the
-    weighted sums.
+    The aggregation takes one pass for the Gramians of all blocks, one small solve, and one pass for
+    the weighted sums.
 
     The result counts the Gramians in which an event occurred; with granularity `block`, each block
     has one Gramian. Event `zero`: a view has no gradient or a gradient of exactly zero. Event
@@ -163,7 +162,7 @@ def transformed(
 ) -> tuple[NDArray[np.float64], PluginState]:
     """Return the checked result of an operator's `transform`.
 
-    Operators that contain other operators call them through this function.
+    An operator that contains other operators calls the other operators through this function.
 
     Raises:
         UserError: The result has a wrong type or shape.
@@ -225,7 +224,10 @@ def _kinds(
         "neutral": "neutral",
         "all": "neutral",
     }
-    if granularity in {"block", "gaussian"}:  # A block may have the name of a group.
+    if granularity in {
+        "block",
+        "gaussian",
+    }:  # Look up the blocks themselves, because a block may have the name of a group.
         kind_by_name = {block.name: block.kind for block in blocks}
     return tuple(map(kind_by_name.__getitem__, names))
 

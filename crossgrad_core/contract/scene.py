@@ -52,8 +52,8 @@ class Placed:
     Attributes:
         gaussians: Gaussians in a frame that may be rotated with respect to the local frame.
         similarity: Maps the frame of `gaussians` to the coordinates of the file.
-        facts: Contents of `.georef.json`, for programs that read the file; empty if nothing is
-            known.
+        facts: Contents of the file `.georef.json`; empty if there are no facts about the
+            coordinates.
         notes: Messages for the user, one sentence each.
     """
 
@@ -137,7 +137,7 @@ def check_coordinates(name: str) -> None:
 
 #: Minimum number of cameras for a search for stray cameras.
 _FEWEST: Final = 5
-#: Largest share of stray cameras. A single stray camera is always possible.
+#: Maximum share of stray cameras. One stray camera is always allowed.
 _MOST: Final = 0.1
 #: A camera is stray if its distance from the median camera centre exceeds the distances of all
 #: other cameras and of most points by this factor.
@@ -164,7 +164,7 @@ def stray_rows(centers: NDArray[np.float64], points: NDArray[np.float64]) -> NDA
     away = np.linalg.norm(centers - middle, axis=1)
     most = max(1, int(_MOST * len(centers)))
     order = np.argsort(away)
-    # The widest gap among the farthest cameras separates the stray cameras.
+    # The widest gap among the farthest cameras separates stray cameras from the other cameras.
     ratios = away[order][-most:] / np.maximum(away[order][-most - 1 : -1], np.finfo(float).tiny)
     first = len(centers) - most + int(ratios.argmax())
     reach = away[order[first - 1]]
@@ -406,8 +406,8 @@ def without_rounding(scene: Scene, lengths: NDArray[np.float64]) -> NDArray[np.f
 
     In regular camera layouts, equal distances differ by the rounding error of the mean camera
     centre. A threshold at the median, a rank or a logarithm would depend on this rounding error. If
-    the rounding error of the scene's input coordinates is larger than this unit, the lengths are
-    rounded to the larger error.
+    the rounding error of the scene's input coordinates is larger, the lengths are rounded to this
+    rounding error.
     """
     largest = float(np.abs(scene.centers).max(initial=0.0))
     given = float(np.abs(scene.similarity.to_input(scene.centers)).max(initial=0.0))

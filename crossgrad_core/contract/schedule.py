@@ -28,7 +28,7 @@ class ViewsPerStep:
         return self.counts[max(0, bisect_left(self.starts, step) - 1)]
 
     def views(self, step: int) -> int:
-        """Return the number of views drawn in all steps up to and including this one."""
+        """Return the number of views drawn in all steps up to and including `step`."""
         ends = (*self.starts[1:], step)
         parts = zip(self.starts, ends, self.counts, strict=True)
         return sum(max(0, min(end, step) - start) * count for start, end, count in parts)
@@ -64,7 +64,7 @@ class ViewsPerStepSpec:
 
     Attributes:
         counts: The values of K.
-        shares: The share of the run's steps after which each K begins, except the first.
+        shares: The share of the run's steps after which each K begins; the first K has no share.
     """
 
     counts: tuple[int, ...] = (1,)
@@ -127,7 +127,7 @@ Unit = Literal["views", "steps"]
 #: Number of steps of a run of 3DGS, with one view per step. All published numbers refer to this
 #: length.
 REFERENCE = 30_000
-#: Length in views up to which the settings for short runs apply in full.
+#: Length in views up to which the settings for short runs have their full effect.
 SHORT = 3_000
 #: Shortest warm-up without growth. In the first few hundred steps of a run of any length, gradients
 #: are large everywhere. Growth in these steps would copy Gaussians that only need to converge.
@@ -190,10 +190,10 @@ class Schedule:
             was stretched.
         lr_until: Count at which the log-linear learning-rate decay ends.
         sh_interval: The SH degree grows by one at every multiple of this count.
-        densify_from: Density control edits after this count. If views are counted, the edits are
-            at this count plus multiples of the interval; if steps are counted, at multiples of the
-            interval.
-        densify_until: Density control edits before this count.
+        densify_from: Density control makes edits after this count. If views are counted, the edits
+            are at this count plus multiples of the interval; if steps are counted, at multiples of
+            the interval.
+        densify_until: Density control makes edits before this count only.
         densify_every: Interval of edits.
         reset_every: Interval of opacity resets; None if there are no resets.
         anchors_from: Anchor growing starts after this count.
@@ -234,8 +234,9 @@ class Schedule:
     ) -> "Schedule":
         """Return the schedule of a run of `total` steps.
 
-        `scaled` stretches the published schedule to the run, with lower bounds. `absolute` uses
-        the numbers of the published length, or of `counting.schedule_length`.
+        Mode `scaled` stretches the published schedule to the length of the run, with lower bounds
+        on intervals. Mode `absolute` uses the numbers of the published length, or of
+        `counting.schedule_length`.
         """
         pace = counting.views.paced(total)
         run_length = pace.views(total) if counting.unit == "views" else total
@@ -308,14 +309,14 @@ class Schedule:
         return self.counted(step) / self.lr_until
 
     def edits(self, after: int = 0) -> int:
-        """Return the number of steps after step `after` in which density control edits."""
+        """Return the number of steps after step `after` in which density control makes an edit."""
         ahead = self._edits_ahead(after)
         if self.counting.unit == "steps" or self.densify_every >= max(self.pace.counts):
             return len(ahead)
         return len(self.edit_steps(after))
 
     def edit_steps(self, after: int = 0) -> list[int]:
-        """Return the steps after step `after` in which density control edits, in order."""
+        """Return the steps after step `after` in which density control makes an edit, in order."""
         return sorted({self.step_of(count) for count in self._edits_ahead(after)})
 
     def _edits_ahead(self, after: int) -> range:
@@ -325,7 +326,7 @@ class Schedule:
 
     @property
     def grows(self) -> bool:
-        """True if density control edits at least once in this run.
+        """True if density control makes at least one edit in this run.
 
         Edits before a change of the run's length count, too.
         """
@@ -349,11 +350,11 @@ class Schedule:
         """Return this schedule with the length of another schedule for all steps after `step`.
 
         The ends of the run, of the learning-rate decay and of density control move if they are
-        still ahead. Changes of K that are still ahead move as well. Intervals do not change;
-        otherwise an event could occur twice or be omitted. Density control does not restart after
-        its end. Levels and spherical harmonics that are already in use stay in use. If a minimum
-        number of edits is set, the remaining edits are planned again. If no edit was made yet, the
-        start of the edits moves, too. The interval shrinks if there would be too few edits.
+        after `step`. Changes of K after `step` move, too. Intervals do not change; otherwise an
+        event could occur twice or be omitted. Density control does not restart after its end.
+        Levels and spherical harmonics that are already in use stay in use. If a minimum number of
+        edits is set, the remaining edits are planned again. If no edit was made yet, the start of
+        the edits moves, too. The interval shrinks if there would be too few edits.
 
         Args:
             wanted: The schedule of a run that had the new length from its start.
@@ -384,7 +385,7 @@ class Schedule:
         return min(maximum, self.sh_from + more)
 
     def densifies(self, step: int) -> bool:
-        """Return True if density control edits the primitives after this step."""
+        """Return True if density control makes an edit after this step."""
         edit = self.next_edit(self.counted(step - 1))
         return edit <= self.counted(step) and edit < self.densify_until
 
@@ -455,7 +456,7 @@ def _fitted(start: int, last: int, every: int, photos: int, edits: int) -> tuple
 
 @dataclass(frozen=True)
 class Phase:
-    """The phase in which a backbone decodes: step, schedule, training or evaluation."""
+    """The step, the schedule, and whether a backbone decodes for training or for evaluation."""
 
     step: int
     training: bool

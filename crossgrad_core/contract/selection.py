@@ -39,12 +39,12 @@ class Selection:
         metrics: The metrics of held-out views, by name.
         rules: The rules that act during training, by name.
         names: Slot (singular word, `reader` included) -> name under which the component was chosen.
-        views_per_step: K; the largest K if it changes.
+        views_per_step: Number of views per step, K; the largest number if K changes.
         device: Torch device type.
         grouping: The grouping; None if the run has no grouping.
         labels: Labels that the grouping gives to training views; None if the labels are not known
             yet or the run has no grouping.
-        view_plan: K over the run; None if K is always `views_per_step`.
+        view_plan: Values of K over the run; None if K is always `views_per_step`.
     """
 
     backbone: Backbone

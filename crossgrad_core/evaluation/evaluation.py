@@ -85,7 +85,7 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | N
 
     Args:
         image: [H, W, 3] in [0, 1], or uint8.
-        target: [H, W, 3] the other image, in the same form.
+        target: [H, W, 3] the photo, in the same form as `image`.
         mask: [H, W] bool, True where the pixel counts; None counts all pixels.
 
     Returns: At most `PSNR_LIMIT`; None if no pixel counts.

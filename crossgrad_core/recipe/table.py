@@ -28,8 +28,8 @@ DECIDED: Final = (
     *("position_lr", "rate_factor", "few_pass_rates", "beta1", "beta2", "step_order"),
     *("eval_every", "save_every"),
 )
-#: First part of the names of rows for rules. The row `rules.NAME` contains the options of the rule,
-#: or False if the rule is not used.
+#: First part of the names of settings for rules. The row `rules.NAME` contains the options of the
+#: rule, or False if the rule is not used.
 RULES: Final = "rules"
 #: Maximum number of decision lines in the terminal.
 LINES: Final = 12
@@ -170,7 +170,7 @@ def _value(config: RunConfig, setting: str) -> object:
 
 
 def short_lines(rows: Iterable[Decision]) -> tuple[str, ...]:
-    """Return one line for each decision that differs from the published value, `LINES` at most."""
+    """Return at most `LINES` lines, one for each decision that differs from the published value."""
     shown = [f"{_value_text(row)}: {row.because} ({row.override})" for row in rows if row.override]
     left = len(shown) - LINES
     if left > 0:

@@ -43,7 +43,7 @@ OURS: Final = "crossgrad"
 
 @dataclass(frozen=True)
 class Entry:
-    """One plugin as its distribution announces it.
+    """An installed plugin, as described by the entry point in its distribution.
 
     Attributes:
         name: The name that users type.
@@ -97,7 +97,7 @@ def find(slot: str, name: str) -> Entry:
     """Return the only entry of a slot with the name `name`.
 
     Raises:
-        UserError: No distribution offers the name, or more than one does.
+        UserError: No distribution offers the name, or several distributions offer it.
     """
     named = [entry for entry in offers(slot) if entry.name == name]
     if not named:
@@ -193,8 +193,9 @@ def notes_on(error: BaseException) -> list[str]:
 def quick_answer(entry: Entry) -> Callable[[Any], Any] | None:
     """Return a component's quick function, which needs no import of the component; or None.
 
-    A package may announce such a function under the name of its component. The function returns the
-    same result as `accepts` of a reader with default options, or as `speed` of a rasterizer.
+    A package may define a quick function in an entry point with the name of the component. The
+    function returns the same result as `accepts` of a reader with default options, or as `speed` of
+    a rasterizer.
 
     Raises:
         UserError: The function cannot be imported.

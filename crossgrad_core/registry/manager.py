@@ -87,7 +87,7 @@ def make_manager(plugins: Mapping[str, object]) -> pluggy.PluginManager:
 
 
 def call_first_result(hook: pluggy.HookCaller, context: StepContext, answer: type[A]) -> A:
-    """Call a first-result hook and return its answer, checked.
+    """Call a first-result hook and return its answer, after a check of the answer's type.
 
     Args:
         hook: A hook that stops at the first answer, such as `manager.hook.crossgrad_densify`.
@@ -111,7 +111,7 @@ def call_first_result(hook: pluggy.HookCaller, context: StepContext, answer: typ
 
 
 def call_all(hook: pluggy.HookCaller, context: StepContext, answer: type[A]) -> list[A]:
-    """Call a hook that several plugins answer and return all answers, checked.
+    """Call a hook that several plugins answer and return all answers, after a check of their types.
 
     Args:
         hook: A hook that all plugins answer, such as `manager.hook.crossgrad_after_step`.

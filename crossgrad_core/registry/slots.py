@@ -33,17 +33,19 @@ GROUPS: Final[dict[str, str]] = {
 }
 #: Slots that a run fills with a list of components.
 LISTS: Final = ("metrics", "observers")
-#: Slots that a run fills with any number of components. The value of `rules` is a mapping of names.
+#: Slots that a run fills with any number of components. The setting `rules` is a mapping from names
+#: to options.
 MANY: Final = (*LISTS, "rules")
-#: The group of commands that packages add to `crossgrad`. It is not a slot of a run.
+#: The group of commands that packages add to `crossgrad`. This group is not a slot of a run.
 COMMANDS: Final = "commands"
 #: Name of a slot, or `commands` -> entry-point group.
 OFFERED: Final[dict[str, str]] = {**GROUPS, COMMANDS: f"crossgrad.{COMMANDS}"}
-#: The group of planners, which decide settings of a run from its scene (`--plan`). It is not a slot
-#: of a run.
+#: The group of planners, which decide settings of a run from its scene (`--plan`). This group is
+#: not a slot of a run.
 PLANNERS: Final = "planners"
-#: Slot -> entry-point group of quick functions. The choice `auto` calls them instead of `accepts`
-#: of a reader and `speed` of a rasterizer, because they need no import of the component.
+#: Slot -> entry-point group of quick functions. The choice `auto` calls these functions instead of
+#: `accepts` of a reader and `speed` of a rasterizer, because these functions need no import of the
+#: component.
 QUICK: Final = {
     "readers": "crossgrad.readers.accepts",
     "rasterizers": "crossgrad.rasterizers.speed",

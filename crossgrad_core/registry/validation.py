@@ -18,7 +18,7 @@ _PREFIXES = ("Input should be ", "Value error, ", "Assertion failed, ")
 def as_user_error(
     error: ValidationError, model: type[BaseModel], *, subject: str, prefix: str = "", todo: str
 ) -> UserError:
-    """Return a user error for the first validation error; it also names all other wrong options.
+    """Return a user error for the first wrong option; the error also names all other wrong options.
 
     Args:
         error: The error of pydantic.

@@ -25,7 +25,8 @@ def run(
 
     Args:
         scene: Scene folder; the bundled example scene by default.
-        config: YAML file with settings, such as the config.yaml of a run; `options` override it.
+        config: YAML file with settings, such as the config.yaml of a run; `options` override the
+            file.
         quiet: Show no progress.
         verbose: Show every decision and event.
         options: Named like the options of `crossgrad run` or like the keys of config.yaml:
@@ -40,7 +41,7 @@ def run(
 
     Raises:
         UserError: The input is invalid; nothing was written.
-        RunFailedError: Training failed; existing results are kept.
+        RunFailedError: Training failed; results that were already written are kept.
         KeyboardInterrupt: The user interrupted the run. In Python's main thread, this exception is
             raised after the current step, and the run can be resumed.
     """
@@ -72,7 +73,7 @@ def resume(
     Raises:
         UserError: The folder is not a run, the run is finished or in use, an option would change
             the training, or the scene or a package has changed.
-        RunFailedError: Training failed; existing results are kept.
+        RunFailedError: Training failed; results that were already written are kept.
         KeyboardInterrupt: See `run`.
     """
     settings = merged(None, options, ())

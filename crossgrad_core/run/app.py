@@ -77,7 +77,9 @@ from crossgrad_core.wording import listed, one_line
 
 
 def check_clock(config: RunConfig) -> None:
-    """Refuse a budget in CPU seconds on several threads or a GPU; call after setting the threads.
+    """Refuse a time budget in CPU seconds on several threads or on a GPU.
+
+    Call this function after the number of threads is set.
 
     Raises:
         UserError: CPU time would count waiting threads, or would miss the work of the GPU.
@@ -260,7 +262,7 @@ def new(settings: Mapping[str, Any], way: Way) -> Outcome:
 
 
 def _with_remarks(setup: Setup) -> tuple[Setup, float]:
-    """Return the setup with messages of exposure and initializer, and the time in seconds."""
+    """Return the setup with messages of exposure and initializer, and the time for the messages."""
     begun, scene = perf_counter(), setup.scene
     messages = setup.exposure.messages(scene, known_starts(setup))
     messages += setup.selection.initializer.messages(scene)

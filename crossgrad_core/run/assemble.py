@@ -120,7 +120,7 @@ def accepts(name: str, path: Path) -> bool:
 
 
 def nearly_accepts(name: str, path: Path) -> bool:
-    """Return True if a file in the folder nearly has the format of a reader (see `accepts`)."""
+    """Return True if a file in the folder has almost the format of a reader (see `accepts`)."""
     return _answer(name, lambda: build(Reader, name, {}).nearly_accepts(path))
 
 
@@ -293,7 +293,7 @@ def _plugins(selection: Selection, observers: Mapping[str, Component]) -> dict[s
 def reasons_against(
     config: RunConfig, selection: Selection, answers: Iterable[list[str]]
 ) -> tuple[str, ...]:
-    """Return the objections of the components and of the core to the selection."""
+    """Return the objections of the components and of the core to the selected components."""
     given = [[answer] if isinstance(answer, str) else answer for answer in answers]
     reasons = objections_to(selection) + [reason for answer in given for reason in answer]
     if config.backward == "joint" and selection.operator.separate:
@@ -308,7 +308,7 @@ def reasons_against(
 
 
 def refuse(reasons: tuple[str, ...]) -> None:
-    """Stop the start of a run if there are reasons against it.
+    """Raise an error if there are reasons against the selected components.
 
     Raises:
         IncompatibleSelectionError: `reasons` is not empty.

@@ -19,7 +19,7 @@ from crossgrad_core.registry.validation import as_user_error
 from crossgrad_core.scene.raw import FARTHEST, FARTHEST_LOCAL
 from crossgrad_core.system.text_files import read_json
 
-#: The name of the built-in path: from the farthest photos to the nearest.
+#: Name of the built-in camera path from the farthest photos to the nearest photos.
 ZOOM: Final = "zoom"
 FRAMES_PER_SECOND: Final = 24.0
 #: Number of frames of a zoom path.
@@ -124,7 +124,10 @@ def _ends(views: Sequence[View], distances: _Floats, points: int) -> tuple[int, 
 
 
 def _way(share: float, nearer: float) -> float:
-    """Return the position (0 to 1) on the line at `nearer ** share` times the first distance."""
+    """Return the position on the line of a zoom path, from 0 to 1.
+
+    At this position, the distance to the points is `nearer ** share` times the first distance.
+    """
     if abs(nearer - 1.0) < 1e-6:  # noqa: PLR2004 - the limit of the next formula
         return share
     return float((1.0 - nearer**share) / (1.0 - nearer))

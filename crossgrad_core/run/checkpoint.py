@@ -71,7 +71,8 @@ class Keep:
 
     Attributes:
         last: Number of newest checkpoints that are kept, including the new one.
-        every: Checkpoints at multiples of this step are kept, too; None keeps none of them.
+        every: Checkpoints at multiples of this step are kept, too; None keeps only the newest
+            checkpoints.
     """
 
     last: int = 2
@@ -108,7 +109,7 @@ def named_checkpoints(folder: Path) -> dict[int, Path]:
 
 
 def damaged(folder: Path, found: str) -> UserError:
-    """Return the error for a damaged checkpoint; the error names a complete one if possible."""
+    """Return the error for a damaged checkpoint; name a complete checkpoint if one exists."""
     named = named_checkpoints(folder.parent).values()
     others = [path for path in named if path.name != folder.name and is_complete(path)]
     return UserError(
@@ -390,7 +391,7 @@ def save(run: Path, checkpoint: Checkpoint, keep: Keep | None = None) -> Path:
 
     Args:
         run: The run's folder.
-        checkpoint: The checkpoint; tensors on any device.
+        checkpoint: The checkpoint, with tensors on any device.
         keep: The rule for older checkpoints; by default the two newest checkpoints are kept.
 
     Returns:
@@ -410,7 +411,7 @@ def save(run: Path, checkpoint: Checkpoint, keep: Keep | None = None) -> Path:
             _write(final, tensors, state)
         except OSError as error:
             # The disk is full. Delete the checkpoints that are no longer kept, which may free
-            # enough space. The newest checkpoint stays.
+            # enough space. The newest checkpoint is kept.
             if not is_full(error) or not _drop(final.parent, keep, checkpoint.step):
                 raise
             _write(final, tensors, state)

@@ -118,7 +118,8 @@ def _moved(camera: Camera, other: Scene, similarity: Similarity) -> Camera:
 def _are_trained(views: Sequence[View], trained: Sequence[View]) -> list[bool]:
     """Return for each view whether its pose is the pose of a training view."""
     centers, rotations = centers_of(trained), _rotations_of(trained)
-    # The trace of the rotation between two cameras decreases when the angle between them increases.
+    # Smallest trace of the rotation between two cameras with the same direction. The trace
+    # decreases when the angle between the cameras increases.
     least = 1.0 + 2.0 * math.cos(SAME_DIRECTION)
 
     def is_trained(center: NDArray[np.float64], rotation: NDArray[np.float64]) -> bool:

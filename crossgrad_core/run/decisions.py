@@ -30,8 +30,8 @@ from crossgrad_core.training.numbers import Numbers
 from crossgrad_core.training.setup import Setup
 
 _LOG = logging.getLogger(__name__)
-#: Function of a planner. It receives the configuration (only the user's settings) and the scene,
-#: and returns the decisions on settings that depend on the scene.
+#: Function of a planner. The function receives the configuration (only the user's settings) and the
+#: scene, and returns the decisions on settings that depend on the scene.
 Planner: TypeAlias = Callable[[RunConfig, Scene], Sequence[Decision]]
 #: Default length of a run if neither steps nor views nor seconds are set (3DGS).
 DEFAULT_STEPS = 30_000

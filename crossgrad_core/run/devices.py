@@ -1,4 +1,4 @@
-"""The device of a run: chosen by the user, or a GPU if a rasterizer works on it."""
+"""The device of a run: the user's choice, or a GPU if a rasterizer works on the GPU."""
 
 import logging
 

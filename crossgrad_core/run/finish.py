@@ -43,7 +43,7 @@ def reason_of(error: BaseException) -> str:
 
 
 def is_unexpected(error: BaseException) -> bool:
-    """Return True if crossgrad did not write the message of the error for users."""
+    """Return True if the message of the error is not written for users."""
     return not isinstance(error, UserError | TrainingFailedError)
 
 
@@ -81,7 +81,7 @@ class Ending:
         status: `finished`, `stopped` (resumable) or `failed`.
         error: The reason of the failure and the missing results; None if nothing failed.
         traced: True if log.txt contains a traceback.
-        cause: The exception that ended training; None if there was none.
+        cause: The exception that ended training; None without an exception.
     """
 
     status: Status
@@ -95,7 +95,7 @@ class RunLoop:
     """A run in progress.
 
     Attributes:
-        setup: The setup; a run with a time budget replaces it.
+        setup: The setup; a run with a time budget replaces the setup.
         state: The state of the training.
         session: The writer of the results.
         log: The run's log.txt.
@@ -201,7 +201,7 @@ class RunLoop:
             try:
                 return action()
             except Exception as error:
-                # Compiled code can replace an interrupt by its own error.
+                # Compiled code may raise its own exception instead of `KeyboardInterrupt`.
                 if self.stopper.at_once:
                     raise KeyboardInterrupt from error
                 raise
@@ -225,7 +225,7 @@ class RunLoop:
         except KeyboardInterrupt:
             if self.ending.error is None:
                 self.ending = replace(self.ending, status="stopped")
-        except (Exception, SystemExit) as error:  # Third-party code may raise anything.
+        except (Exception, SystemExit) as error:  # Third-party code may raise any exception.
             self._note(error, missing)
 
     def _note(self, error: BaseException, missing: str) -> None:
@@ -336,7 +336,7 @@ class Forecast:
         return self._length.due(state) or self._is_time(state)
 
     def revised(self, setup: Setup, state: TrainState) -> Setup:
-        """Return the setup with the present length, and log the estimate at its time."""
+        """Return the setup with the present length, and log the estimate if it is due."""
         if self._length.due(state):
             setup = self._length.revised(setup, state)
         if self._is_time(state):

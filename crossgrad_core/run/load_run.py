@@ -97,7 +97,8 @@ def settings_of(config: RunConfig) -> dict[str, Json]:
     else:
         loose |= {"steps"}  # The run may have changed the number of steps to meet its time budget.
     data = config.model_dump(mode="json", exclude=loose)
-    # Ignore the rasterizer, because another machine may use another one, but compare its options.
+    # Ignore the rasterizer, because another machine may use another rasterizer, but compare its
+    # options.
     del data[_DRAWN]["name"]
     # Use the default of `_config` if the configuration of the run does not contain this setting.
     data |= {
@@ -115,7 +116,8 @@ def to_checkpoint(state: TrainState, config: RunConfig | None = None) -> Checkpo
 
     Args:
         state: The state.
-        config: The configuration that trained the state, if a later load must compare it.
+        config: The configuration that trained the state; None if a later load need not compare
+            settings.
     """
     scalars: dict[str, Any] = {
         "settings": {} if config is None else settings_of(config),
@@ -162,7 +164,7 @@ def check_settings(config: RunConfig, checkpoint: Checkpoint) -> None:
     """Refuse a state that was trained with other settings than `config`.
 
     Raises:
-        UserError: Settings that affect training differ from the checkpoint's.
+        UserError: Settings that affect training differ from the settings in the checkpoint.
     """
     stored = checkpoint.scalars.get("settings")
     if not isinstance(stored, dict) or stored.get("crossgrad") != VERSION:
@@ -454,7 +456,7 @@ def continued(
     accept_scene: bool = False,
     accept_plugins: bool = False,
 ) -> tuple[Setup, TrainState]:
-    """Load a run's setup and the state from which it continues.
+    """Load a run's setup and the state from which the run continues.
 
     The state is the state of the newest checkpoint, or the initial state if there is no checkpoint.
 

@@ -23,7 +23,7 @@ class Wanted:
 
     Attributes:
         device: Torch device type.
-        response: The backbone's pixel response.
+        response: The value `response` of the backbone.
         outputs: Optional outputs that the densifier needs.
         options: Options that the user or the recipe sets.
     """
@@ -135,7 +135,7 @@ def drawn_elsewhere(config: RunConfig) -> RunConfig:
 def speeds_on(device: str) -> tuple[dict[str, float], list[str]]:
     """Return name -> speed of a device's rasterizers, and notes on broken rasterizers.
 
-    A rasterizer that declares its speed without an import is not imported.
+    A rasterizer with a quick function for its speed is not imported.
     """
     speeds: dict[str, float] = {}
     notes = []

@@ -174,7 +174,7 @@ def _metrics(config: RunConfig, scene: Scene, notes: list[str]) -> dict[str, Met
     """Return the metrics by name; leave out a default metric whose column already exists.
 
     Raises:
-        UserError: Two columns of metrics.csv would have one name.
+        UserError: Two columns of metrics.csv would have the same name.
     """
     metrics: dict[str, Metric] = {}
     regimes = sorted({view.regime for view in scene.test_views})
@@ -249,7 +249,7 @@ def operator_of(config: RunConfig) -> tuple[Operator, str]:
 
 
 def views_per_step_of(config: RunConfig) -> tuple[ViewsPerStepSpec, str]:
-    """Return K of each step, and why K differs from the sampler's default; empty if it is equal.
+    """Return K of each step, and the reason if K differs from the sampler's default; else empty.
 
     If the user sets no K, K is the sampler's default. If the operator does not work with this K, K
     is the smallest number that both components support.

@@ -206,7 +206,7 @@ class Session:
 
 @contextmanager
 def reporting(state: TrainState) -> Iterator[None]:
-    """Add the seconds of the block to the reporting time."""
+    """Add the duration of the block to the reporting time."""
     start = perf_counter()
     yield
     state.clock.report += perf_counter() - start

@@ -466,7 +466,7 @@ def _holder(settings: Settings, path: tuple[str, ...]) -> Settings:
 
 
 def _inner(holder: object, path: tuple[str, ...], depth: int) -> object:
-    """Return the value that `path[depth]` names inside a value."""
+    """Return the value inside `holder` with the key `path[depth]`."""
     part = path[depth]
     match holder:
         case dict():

@@ -155,7 +155,7 @@ def _of_the_schedule(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str
     if config.clock == "cpu" and not (config.seconds or config.planned_seconds):
         yield "clock", "the length of the run is not given in seconds; add --seconds"
     stop, total = config.stop_after, setup.schedule.total
-    # A run with a time budget may become longer.
+    # Accept any step in a run with a time budget, because the run may become longer.
     if stop is not None and stop > total and not (config.seconds or config.planned_seconds):
         yield "stop_after", f"the run ends after step {total}"
     if config.min_refinements and not setup.schedule.min_refinements:

@@ -29,8 +29,9 @@ _HUGE: Final[int] = getattr(mmap, "MADV_HUGEPAGE", 14)
 def keep_freed_memory() -> None:
     """Keep up to 512 MiB of freed memory in the process, for the arrays of the next step.
 
-    By default, glibc returns the memory to the system after every step. The kernel would then clear
-    each page again when the next step first writes to it. Other C libraries are not affected.
+    By default, glibc returns the memory to the system after every step. The operating system would
+    then clear each page again when the next step first writes to the page. Other C libraries are
+    not affected.
     """
     heap = _heap()
     if heap is not None:

@@ -152,9 +152,9 @@ def clear_leftovers(folder: Path, *, shared: bool = False) -> None:
 
 
 def _is_alive(process: int) -> bool:
-    """Return True if another process of this machine has that number."""
-    # An earlier process with the same number wrote the file. Process numbers repeat in a container,
-    # for example.
+    """Return True if another process of this machine has this process number."""
+    # A file with the number of this process was written by an earlier process. Process numbers
+    # repeat in a container, for example.
     if process == os.getpid():
         return False
     try:
@@ -175,7 +175,7 @@ def text_bytes(text: str) -> bytes:
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a whole file through `atomic_file`."""
+    """Write a file completely or not at all."""
     with atomic_file(path, len(content)) as file:
         file.write(content)
 

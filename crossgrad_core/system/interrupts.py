@@ -18,7 +18,7 @@ SIGNALS = tuple(
 )
 #: Lines that tell the user how to continue after an immediate end. The newest line is last.
 _WAYS_ON: list[str] = []
-#: Files that are being written. They are deleted if the process ends immediately.
+#: Files that are being written. These files are deleted if the process ends immediately.
 UNFINISHED: set[str] = set()
 #: Numbers of the processes that write unfinished files. These processes are ended before the files
 #: are deleted.
@@ -50,7 +50,7 @@ def tell(text: str, *, alone: bool = True) -> None:
         with suppress(OSError):
             os.write(2, line.encode(errors="backslashreplace"))
     except (OSError, ValueError):
-        pass  # The message cannot be shown anywhere else.
+        pass  # Ignore the error, because the message cannot be shown anywhere else.
 
 
 def end_at_once(number: int, _frame: FrameType | None) -> None:

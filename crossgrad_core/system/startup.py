@@ -1,4 +1,4 @@
-"""Progress of a command: a line for each stage, a clock while kernels compile, and counts.
+"""Progress of a command: a line for each stage, and a clock while kernels compile.
 
 This module shows log messages of the package. Slow stages log a message such as `reading scene
 ...`, and the kernel cache logs a message before it compiles a kernel. This module imports no large
@@ -115,7 +115,7 @@ class _Compiling:
         self._seconds = 0.0
 
     def stop(self) -> bool:
-        """End the clock; return True if it was running."""
+        """End the clock; return True if the clock was running."""
         if self._thread is None:
             return False
         self._over.set()
@@ -143,7 +143,7 @@ def _say(text: str, *, stays: bool = True) -> None:
 
 
 class Progress:
-    """Lines on stderr that begin with three dots, at most one per pause.
+    """A writer of progress lines on stderr that begin with three dots, at most one per pause.
 
     Args:
         pause: Seconds between two lines; 0 shows all lines. The first pause begins immediately.

@@ -117,7 +117,7 @@ class _Rows(list[str]):
 
 
 def as_cell(value: float | str | None) -> str:
-    """Return a value with all its digits; an empty cell for None."""
+    """Return the text of a CSV cell: a value with all its digits, or nothing for None."""
     return "" if value is None else str(value)
 
 

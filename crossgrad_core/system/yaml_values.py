@@ -160,7 +160,7 @@ def write_yaml(settings: Mapping[str, Any]) -> str:
 
 
 class _Values:
-    """A builder of plain data from nodes; aliases are copied, and every copy counts."""
+    """A builder of plain data from nodes; the values of aliases are copied and count again."""
 
     def __init__(self) -> None:
         self._count = 0

@@ -57,10 +57,10 @@ class Backbone(Component):
     @classmethod
     @override
     def __pydantic_init_subclass__(cls, **kwargs: object) -> None:
-        # The `decode` of a subclass may read a tensor that its parent only passes through.
+        # The `decode` of a subclass may read a tensor that the parent's `decode` does not read.
         if "passthrough" not in vars(cls):
             cls.passthrough = {}
-        # A subclass may store sizes and rotations in another way.
+        # A subclass may store standard deviations and rotations in another form.
         if "axes" not in vars(cls):
             cls.axes = ()
 

@@ -59,8 +59,7 @@ class Densifier(Component):
         An edit must keep at least a tenth of the primitives of a model that trains well, because a
         model does not recover from the loss of nearly all primitives.
 
-        The core gathers the rows of `state.per_primitive` of *the returned state* together with the
-        edit.
+        The core applies the edit to the rows of `per_primitive` in the *returned* state, too.
         """
 
     @hookimpl

@@ -95,7 +95,7 @@ class Exposure(Component):
         return values
 
     def shift(self, name: str, values: Tensor, start: Tensor, end: Tensor) -> Tensor:
-        """Return the values [P, ...] of a parameter after the change from `start` to `end`.
+        """Return the values [P, ...] of a parameter, shifted by the change from `start` to `end`.
 
         By default `end - start` is added to every value, so the differences between photos do not
         change. The shift adapts the values of all photos to values that the user gives in a file.
@@ -105,7 +105,7 @@ class Exposure(Component):
     def predict_unseen(
         self, view: View, scene: Scene, values: Mapping[str, Tensor]
     ) -> Mapping[str, Tensor]:
-        """Return the values of a view that is not used for training, without reading its pixels.
+        """Return the exposure values of a view without a training photo; do not read its pixels.
 
         By default, each value is the mean over the training photos of the view's regime. If the
         regime contains no training photo, the mean is over all training photos.
@@ -113,7 +113,7 @@ class Exposure(Component):
         Args:
             view: The view.
             scene: The scene.
-            values: Name -> [P, ...] of the training photos.
+            values: Name -> values [P, ...] of the training photos.
         """
         regimes = [photo.regime for photo in scene.train_views]
         rows = [row for row, regime in enumerate(regimes) if regime == view.regime]

@@ -93,8 +93,8 @@ class Grouping(Component):
             scene: The scene.
             views: The views whose quantity is returned.
 
-        A run reports if the quantity has a single mode. Returns: None (the default) for rules that
-        use more than one number per view.
+        A run reports if the distribution of the quantity has a single mode. Returns: None (the
+        default) for rules that use more than one number per view.
         """
         return None
 

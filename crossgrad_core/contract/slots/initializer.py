@@ -19,8 +19,8 @@ class MorePoints:
         positions: [N, 3] float64, local frame.
         colors: [N, 3] uint8 RGB.
         sizes: [N] float64, local units: standard deviation of the Gaussian of a point, if the
-            backbone makes Gaussians from points. NaN selects the distance to the neighbours, as for
-            the points of the scene.
+            backbone makes Gaussians from points. NaN selects a size from the distance to the
+            neighbours, as for the points of the scene.
         opacities: [N] float64 in (0, 1): opacity of the Gaussian of each point. NaN selects the
             value of the backbone.
     """

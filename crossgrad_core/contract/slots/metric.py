@@ -17,7 +17,7 @@ from crossgrad_core.contract.scene import View
 class Compared:
     """A held-out view with the render and the photo that a metric compares.
 
-    Metrics must not change any of its contents.
+    Metrics must not change this object or its tensors.
 
     Attributes:
         view: The view.

@@ -69,8 +69,8 @@ class Operator(Component):
     ) -> tuple[AggregateResult, PluginState]:
         """Return one gradient per tensor, and the new state.
 
-        The result must not depend on the order of the views in the step. It may depend only on
-        labels, losses, distances and gradients. Views with equal labels, losses, distances and
+        The result must not depend on the order of the views in the step. The result may depend only
+        on labels, losses, distances and gradients. Views with equal labels, losses, distances and
         gradients must have equal weights.
 
         Args:

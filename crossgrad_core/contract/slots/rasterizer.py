@@ -14,7 +14,7 @@ from crossgrad_core.contract.scene import Camera
 
 
 class Rasterizer(Component):
-    """A renderer of Gaussians that follows one common rule set (see docs/rasterizers.md).
+    """A renderer of Gaussians that follows the common rules in docs/rasterizers.md.
 
     Attributes:
         max_alpha: Upper limit of a Gaussian's alpha (0.99 as in 3DGS and gsplat 1.6; 0.999 in
@@ -70,8 +70,8 @@ class Rasterizer(Component):
     def missing(cls, device: str) -> str:  # noqa: ARG003 - subclasses use the argument
         """Return the missing requirements for a device on this machine, and how to install them.
 
-        Empty if nothing is missing, or if the rasterizer does not support the device. `--device
-        auto` shows this text if the machine has a GPU that no rasterizer uses.
+        The text is empty if nothing is missing, or if the rasterizer does not support the device.
+        `--device auto` shows this text if the machine has a GPU that no rasterizer uses.
 
         Args:
             device: Torch device type.

@@ -27,8 +27,8 @@ class Facts:
     Attributes:
         device: Torch device type.
         planned: Planned number of steps; None while only the time budget is known.
-        total: Present number of steps. It differs from `planned` if a time budget made the run
-            longer or shorter.
+        total: Present number of steps. The number differs from `planned` if a time budget made the
+            run longer or shorter.
         mode: `scaled` if the published schedule is stretched to the run, else `absolute`.
         schedule_length: Length for which the schedule is written. If None, a scaled schedule uses
             the length of the run, and an absolute schedule uses the published length.
@@ -116,8 +116,8 @@ class Recipe(Component):
     Attributes:
         settings: Settings that the recipe fixes before any fact is known, such as the sampler and
             the length. The user's settings override these settings.
-        rasterizer_options: Options that a rasterizer must have, or `--rasterizer auto` does not
-            choose it for this recipe.
+        rasterizer_options: Options that `--rasterizer auto` requires of a rasterizer for this
+            recipe.
     """
 
     slot: ClassVar[str] = "recipes"
@@ -130,6 +130,6 @@ class Recipe(Component):
 
 
 def with_rows(rows: Iterable[Decision], others: Sequence[Decision]) -> list[Decision]:
-    """Return `rows` after each row of `others` replaced the row for its setting or was appended."""
+    """Return `rows`, updated by `others`: a row replaces the row of its setting or is appended."""
     table = {row.setting: row for row in rows}
     return [*(table | {row.setting: row for row in others}).values()]

@@ -63,7 +63,7 @@ class Resolution(Component):
     ) -> tuple[tuple[float, ...], PluginState]:
         """Return one scale in (0, 1] for each view of `context.draw`, and the new state.
 
-        Random numbers come from `context.rng`.
+        Random numbers must come from `context.rng`.
         """
 
     @hookimpl

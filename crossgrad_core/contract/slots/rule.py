@@ -53,7 +53,7 @@ class GaussiansContext(StepContext):
 
 @dataclass(frozen=True, eq=False)
 class GaussiansResult(Answer):
-    """Result of `crossgrad_view_gaussians`: the Gaussians to render, in unchanged number."""
+    """Result of `crossgrad_view_gaussians`: the Gaussians to render, as many as before."""
 
     gaussians: Gaussians
 

@@ -69,10 +69,10 @@ def is_changed(setup: Setup) -> bool:
 
 
 def own_name(folder: Path, name: str, step: int) -> str:
-    """Return a file name for results of a step that does not replace a file of another step.
+    """Return a name for a file of results that does not replace a file of another step.
 
-    The run may have been continued and killed after it wrote summary.json. The other files then
-    belong to an older step.
+    A run may have been continued and killed after it wrote summary.json. Then summary.json and its
+    files belong to an older step than the newest checkpoint.
     """
     described = summarised_step(folder)
     if described in {None, step}:

@@ -45,9 +45,9 @@ def render(
         on: Folder of another capture of the same place, whose views are rendered instead.
 
     Raises:
-        UserError: The folder is not a run, the run has no checkpoint, the split is empty, `out`
-            already contains such a picture, or the run is training and `out` is not given; see also
-            `elsewhere`.
+        UserError: The folder is not a run, the run has no checkpoint, or the split is empty. Also
+            if `out` already contains a picture of the same name, or if the run is training and
+            `out` is not given. See also `elsewhere`.
     """
     with writing(folder, out, "rendering"):
         check_folder(out or folder)
@@ -95,9 +95,9 @@ def render_path(
         how: The options for opening the run.
 
     Raises:
-        UserError: See `camera_path`. Also if the folder is not a run, the run has no checkpoint,
-            the run is training and `out` is not given, `out` already contains a video or such
-            frames, or `frames` is given for a path from a file.
+        UserError: See `camera_path`. Also if the folder is not a run, the run has no checkpoint, or
+            the run is training and `out` is not given. Also if `out` already contains a video or
+            frames of the same names, or if `frames` is given for a path from a file.
     """
     if frames is not None and path != ZOOM:
         raise UserError(

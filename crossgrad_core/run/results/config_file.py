@@ -22,7 +22,7 @@ NOTES: Final = "notes"
 
 
 def write_config(folder: Path, config: RunConfig, notes: Sequence[str] = ()) -> None:
-    """Write the configuration that repeats the run, and its first notes.
+    """Write the configuration that repeats the run, and the notes of the run's start.
 
     A run with a time budget writes the file again when its length changes.
     """

@@ -1,4 +1,4 @@
-"""Copies of files of a run in its checkpoints, with which damage is detected or repaired."""
+"""Copies of a run's files in its checkpoints, which help to detect or repair damage."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,7 +22,7 @@ _REVISED: Final = frozenset({"steps", "revisions"})
 
 
 def kept_files(folder: Path) -> dict[str, Json]:
-    """Return the texts of the files that a checkpoint stores, if they exist."""
+    """Return file name -> content for the existing files that a checkpoint stores."""
     contents = {name: _content(folder / name) for name in (CONFIG, METRICS)}
     return {
         name: text.decode(errors="replace") for name, text in contents.items() if text is not None

@@ -69,7 +69,7 @@ def locked(folder: Path, doing: str) -> Iterator[bool]:
 
     Args:
         folder: The run's folder.
-        doing: The work of this process in the folder, for messages to refused processes.
+        doing: The work of this process in the folder, for messages of other processes.
 
     Yields: True if the folder is locked, False if the file system does not support locks, as on
     some networks.

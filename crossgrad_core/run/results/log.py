@@ -26,7 +26,7 @@ class Pace:
         first: The step after which this session began (above 0 for a resumed run).
         record: The last step; None before the first step.
         loss: Exponentially smoothed mean loss of the step's views.
-        seconds: Exponentially smoothed training seconds of a step; None after the first step only.
+        seconds: Exponentially smoothed training seconds of a step; None before the second step.
         psnr: Overall PSNR of the last evaluation; None before the first evaluation.
         planned: Number of steps of the first plan if the length has changed; None otherwise.
     """
@@ -75,7 +75,7 @@ class Pace:
 
 
 def progress_line(pace: Pace) -> str:
-    """Return a line with step, loss, PSNR, primitives, speed and remaining time; empty at first."""
+    """Return a line about the progress of a run; empty before the first step."""
     record = pace.record
     if record is None:
         return ""

@@ -34,8 +34,8 @@ class Calibration:
     Attributes:
         seconds: Duration of the calibration.
         rate: Passes over the workload per second of wall-clock time.
-        cpu_rate: Passes over the workload per second of CPU time, which depend little on other
-            processes.
+        cpu_rate: Passes over the workload per second of CPU time. Other processes have little
+            effect on this number.
     """
 
     seconds: float

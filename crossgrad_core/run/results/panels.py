@@ -30,7 +30,7 @@ _LONGEST = 120  # bytes
 def flat_names(names: Sequence[str]) -> dict[str, str]:
     """Return view name -> unique file name without folders and suffix.
 
-    The file names also differ in more than upper and lower case.
+    Two file names always differ in more than upper and lower case.
 
     `aerial/0001.jpg` becomes `aerial__0001`; a name that is already used gets -2, -3 and so on.
     """
@@ -109,7 +109,7 @@ class Layout:
 
     @property
     def top(self) -> int:
-        """Upper edge of the images."""
+        """Vertical position of the upper edge of the images."""
         return self.margin + round(3.2 * self.font)
 
     @property

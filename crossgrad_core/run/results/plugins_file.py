@@ -80,7 +80,7 @@ def read_plugins(folder: Path, *, quiet: bool = False) -> Packages | None:
 
 
 def with_present(known: Packages | None, present: Packages) -> Packages:
-    """Return the known packages after the versions of the present packages were added."""
+    """Return the known packages, extended by the versions of the present packages."""
     known = known or {}
     packages = {**known}
     for name, package in present.items():

@@ -20,7 +20,7 @@ from crossgrad_core.run.results.summary import read_summary
 from crossgrad_core.system.checksums import check_unchanged
 from crossgrad_core.system.text_files import read_json
 
-#: File with the fingerprint of a run's scene. The module results/scene_file.py writes it.
+#: File with the fingerprint of a run's scene. The module results/scene_file.py writes this file.
 SCENE = "scene.json"
 #: The files of a run that this module reads.
 _READ: Final = (CONFIG, METRICS, PER_VIEW, SUMMARY, SCENE)

@@ -35,7 +35,7 @@ class Summary:
         status: Status of the run at its end.
         scene: Name of the scene.
         totals: The cost of the run: steps, views, backward passes, time, primitives and memory.
-        result: The last evaluation; None if there was none.
+        result: The last evaluation; None without an evaluation.
         rows: All rows of metrics.csv, from which the best evaluation is determined.
         seconds: Wall-clock seconds of training, loading and other activities; training seconds also
             by phase.
