@@ -90,7 +90,7 @@ class Gaussians:
         return self.mapped(torch.Tensor.detach)
 
     def misfit(self) -> str | None:
-        """Return the first mismatch, such as `colors is [5, 1], not [5, 3]`; None if all are right."""
+        """Return the first wrong shape, such as `colors is [5, 1], not [5, 3]`; else None."""
         if (self.colors is None) == (self.sh_dc is None):
             return "either colors or sh_dc must be given, not both or neither"
         number, rest, degree = len(self), self.sh_rest, self.sh_degree

@@ -224,10 +224,8 @@ def _kinds(
         "neutral": "neutral",
         "all": "neutral",
     }
-    if granularity in {
-        "block",
-        "gaussian",
-    }:  # Look up the blocks themselves, because a block may have the name of a group.
+    # Look up the blocks themselves, because a block may have the name of a group.
+    if granularity in {"block", "gaussian"}:
         kind_by_name = {block.name: block.kind for block in blocks}
     return tuple(map(kind_by_name.__getitem__, names))
 

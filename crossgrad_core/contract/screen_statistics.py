@@ -57,7 +57,7 @@ def directions(record: RenderedView) -> Tensor:
 
 
 def pixels(record: RenderedView) -> Tensor:
-    """Return [N], the number of pixels of the full photo that a Gaussian was blended into (float)."""
+    """Return [N], the number of the full photo's pixels in which a Gaussian was blended (float)."""
     return of_photo(record, _present(record.screen.pixels))
 
 
