@@ -100,7 +100,7 @@ class RunConfig(BaseModel):
     )
     rasterizer: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
         ComponentChoice(name=AUTO),
-        description="Renders the views. Default: auto, the fastest one for the device.",
+        description="Renders the views. Default: auto, the fastest rasterizer for the device.",
     )
     loss: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
         ComponentChoice(name=defaults.LOSS),
@@ -142,7 +142,8 @@ class RunConfig(BaseModel):
 
     views_per_step: Annotated[int | str | None, Flag("K", TRAINING, "views")] = Field(
         None,
-        description="Number of views per step, K; 1..2@0.5 changes it after half of the steps. "
+        description="Number of views per step, K; 1..2@0.5 changes K from 1 to 2 after half of "
+        "the steps. "
         "Default: auto.",
     )
     steps: Annotated[int | None, Flag("N", TRAINING, common=True)] = Field(
@@ -157,7 +158,7 @@ class RunConfig(BaseModel):
         "limit that it reaches first.",
     )
     seconds: Annotated[float | None, Flag("S", TRAINING, common=True)] = Field(
-        None, gt=0, description="Training time in seconds; it determines the number of steps."
+        None, gt=0, description="Training time in seconds, which determines the number of steps."
     )
     clock: Annotated[Literal["wall", "cpu"], Flag("wall|cpu", TRAINING)] = Field(
         "wall",
@@ -173,7 +174,7 @@ class RunConfig(BaseModel):
         (), description="settings that changed with each entry of revisions"
     )
     planned_seconds: float | None = Field(
-        None, gt=0, description="seconds of a run with a time budget"
+        None, gt=0, description="training seconds of a run with a time budget"
     )
     planned_views: int | None = Field(
         None, ge=1, description="maximum number of views of a run with a time budget"
@@ -230,7 +231,8 @@ class RunConfig(BaseModel):
         Field(
             "all",
             description="Views whose statistics density control uses: all views of a step, only "
-            "one of them, or all plus one extra view that is not trained on. Default: all.",
+            "one of these views, or all views and one extra view that is not trained on. Default: "
+            "all.",
         )
     )
     rate_factor: Annotated[float | None, Flag("F", TRAINING)] = Field(
@@ -243,8 +245,8 @@ class RunConfig(BaseModel):
         None,
         ge=0.9,
         lt=1,
-        description="decay of Adam's second moment; if it is set, the learning rates for many "
-        "passes over the photos are used",
+        description="decay of Adam's second moment; setting beta2 selects the learning rates for "
+        "many passes over the photos",
     )
     few_pass_rates: bool | None = Field(
         None, description="true: use the learning rates for few passes over the photos"
@@ -293,8 +295,8 @@ class RunConfig(BaseModel):
     )
     device: Annotated[str, Flag("auto|cpu|cuda|cuda:N", MACHINE, common=True)] = Field(
         AUTO,
-        description="Device of the tensors; auto: a GPU if a rasterizer works on it, else the "
-        "CPU. Default: auto.",
+        description="Device of the tensors; auto: a GPU if a rasterizer works on the GPU, else "
+        "the CPU. Default: auto.",
     )
     threads: Annotated[int | None, Flag("N", MACHINE)] = Field(
         None, ge=1, description="Number of CPU threads. Default: all."
@@ -332,7 +334,8 @@ class RunConfig(BaseModel):
     max_nonfinite_blocks: int = Field(
         100,
         ge=1,
-        description="stop the run after this many blocks were dropped because they were not finite",
+        description="stop the run after this number of blocks were dropped because their "
+        "gradients were not finite",
     )
 
     @model_validator(mode="before")

@@ -135,15 +135,15 @@ _LAST: Final = (
         bool,
         "--prepare",
         heading=SCENE,
-        help="SCENE is a folder of photos without poses: first estimate the poses, as "
-        "`crossgrad prepare` does, into SCENE-scene.",
+        help="SCENE is a folder of photos without poses. First estimate the poses, as `crossgrad "
+        "prepare` does, and write the scene to the folder SCENE-scene.",
     ),
     _own(
         "dry_run",
         bool,
         "--dry-run",
-        help="Check everything and print the resolved settings without training. With "
-        "--prepare, the photos are prepared.",
+        help="Check everything and print the resolved settings without training. With --prepare, "
+        "the poses are still estimated.",
     ),
     _own(
         "check",

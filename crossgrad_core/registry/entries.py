@@ -110,8 +110,8 @@ def find(slot: str, name: str) -> Entry:
             where=singular(slot),
             expected="one package per name",
             found=listed(f"{entry.distribution} {entry.version}" for entry in named),
-            todo=f"rename it in {listed(others)}, or uninstall that package: the name belongs "
-            "to crossgrad"
+            todo=f"rename the plugin in {listed(others)}, or uninstall that package: the name "
+            "belongs to crossgrad"
             if ours
             else "uninstall all of these packages except one",
         )

@@ -135,7 +135,7 @@ def wrong_answer(hook: pluggy.HookCaller, expected: str, found: str) -> UserErro
         where=f"one of {listed(impl.plugin_name for impl in hook.get_hookimpls())}",
         expected=expected,
         found=found,
-        todo="repair the plugin (docs/hooks.md), or run without it",
+        todo="repair the plugin (docs/hooks.md), or run without this plugin",
     )
 
 

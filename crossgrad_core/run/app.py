@@ -199,7 +199,7 @@ def run(  # noqa: PLR0913 - one parameter per option of the command line
         raise UserError(
             "--accept-plugins has no effect on a new run",
             where="--accept-plugins",
-            todo="leave it out, or name a run to resume with --resume",
+            todo="leave --accept-plugins out, or name a run to resume with --resume",
         )
     if accept_scene:
         settings = layered([settings, {"data.accept_scene": True}])
@@ -373,8 +373,8 @@ def _held(folder: Path) -> Iterator[None]:
     with locked(folder, "training") as held:
         if not held:
             _LOG.warning(
-                "the file system of %s does not support locks, so that nothing prevents a "
-                "second process from writing to it",
+                "the file system of %s does not support locks, so a second process could write to "
+                "the same folder",
                 folder,
             )
         clear_half_written(folder)

@@ -116,7 +116,7 @@ def damaged(folder: Path, found: str) -> UserError:
         "the checkpoint is damaged",
         where=folder,
         found=found,
-        todo=f"remove it; the run then continues from {others[-1].name}"
+        todo=f"remove this folder; the run then continues from {others[-1].name}"
         if others
         else "start the run again",
     )
@@ -194,7 +194,7 @@ def check_json(value: object, where: str) -> None:
             where=where,
             expected="numbers, strings, lists, dictionaries with text keys, None",
             found=wrong,
-            todo="keep arrays as tensors in PluginState.tensors",
+            todo="store arrays as tensors in PluginState.tensors",
         )
 
 
@@ -224,7 +224,7 @@ def read_state(folder: Path) -> dict[str, Any]:
             where=folder,
             expected=f"version {FORMAT} (crossgrad {VERSION})",
             found=f"version {state['format']} (crossgrad {state.get('crossgrad', '?')})",
-            todo="resume with the version of crossgrad that wrote it",
+            todo="resume with the version of crossgrad that wrote the checkpoint",
         )
     _check_whole(state, folder)
     return state

@@ -56,8 +56,8 @@ class Elsewhere:
         if not self.alike:
             messages.append(
                 "the points of this capture match the scene of the run hardly better than "
-                "after a random rotation: check the renders, and check that both show the "
-                "same place in the same coordinates"
+                "after a random rotation: check the renders, and check that the capture and the "
+                "run show the same place in the same coordinates"
             )
         if self.trained:
             messages.append(f"left out: {self.trained} views that the run was trained on")
@@ -151,7 +151,7 @@ def _check_place(
             "the other capture does not overlap with the scene of the run",
             where=f"--on {path}",
             expected="a capture of the same place, in the coordinate system of the run's scene",
-            found=f"{share:.0%} of its points are inside the run's scene",
+            found=f"{share:.0%} of the capture's points are inside the run's scene",
             todo="align the two models first, or estimate the poses of all photos together",
         )
 

@@ -98,14 +98,14 @@ def _rasterizer(config: RunConfig) -> tuple[str, str]:
     if name != AUTO:
         named = load(Rasterizer, name)
         runs = "cuda" in named.devices
-        return name, named.missing("cuda") if runs else f"rasterizer {name} does not run on it"
+        return name, named.missing("cuda") if runs else f"rasterizer {name} does not run on the GPU"
     on_cpu = max(speeds_on("cpu")[0].values(), default=0.0)
     speeds, notes = speeds_on("cuda")
     faster = {rasterizer: speed for rasterizer, speed in speeds.items() if speed > on_cpu}
     able = fastest_able(faster, demands(config, "cuda", *_trained(config)), notes)
     if able is not None:
         return able, ""
-    return name, sentences(*notes, *_missing()) or "no installed rasterizer is faster on it"
+    return name, sentences(*notes, *_missing()) or "no installed rasterizer is faster on the GPU"
 
 
 def _trained(config: RunConfig) -> tuple[Backbone, Densifier]:

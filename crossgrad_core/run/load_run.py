@@ -319,7 +319,7 @@ def without_missing(config: RunConfig) -> RunConfig:
         lacking.append(f"rules {listed(gone)}")
         update["rules"] = {n: options for n, options in config.rules.items() if n not in gone}
     if lacking:
-        _LOG.warning("not installed here, so they are not used: %s", listed(lacking))
+        _LOG.warning("components that are not installed here are not used: %s", listed(lacking))
     return config.model_copy(update=update)
 
 
@@ -422,7 +422,7 @@ def require_checkpoint(folder: Path) -> None:
             found=writer or "a run that ended before its first checkpoint",
             todo="wait for the first checkpoint"
             if writer
-            else f"start it again: crossgrad run --resume {folder}",
+            else f"start the run again: crossgrad run --resume {folder}",
         )
 
 

@@ -137,7 +137,8 @@ class Session:
                 "the folder of the run no longer exists",
                 where=self.folder,
                 expected="the folder that the run was started in",
-                todo="if it was moved, resume the run there: `crossgrad run --resume FOLDER`",
+                todo="if the folder was moved, resume the run in its new folder: `crossgrad run "
+                "--resume FOLDER`",
             )
 
     def rewind(self, setup: Setup, step: int) -> None:

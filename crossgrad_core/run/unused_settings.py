@@ -68,7 +68,7 @@ def refuse_settings_for_nothing(config: RunConfig, setup: Setup) -> None:
             "some settings would have no effect",
             where=listed(name for name, _ in ineffective),
             found="; ".join(f"{name}: {why}" for name, why in ineffective),
-            todo="leave them out, or change the setting that makes them ineffective",
+            todo="leave these settings out, or change the setting that makes them ineffective",
         )
 
 
@@ -106,10 +106,13 @@ def _of_density_control(config: RunConfig, setup: Setup) -> Iterator[tuple[str, 
     if not densifier.edits and config.max_gaussians == AUTO:
         yield (
             "max_gaussians",
-            f"densifier {name} makes no edits, and auto sets no limit on the start",
+            f"densifier {name} makes no edits, and auto does not limit the initial Gaussians",
         )
     elif not densifier.edits and config.max_gaussians and config.data.init_file is not None:
-        yield "max_gaussians", f"densifier {name} makes no edits, and a PLY is used unchanged"
+        yield (
+            "max_gaussians",
+            f"densifier {name} makes no edits, and the Gaussians of a PLY file are used unchanged",
+        )
 
 
 def _of_resets(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
@@ -225,7 +228,7 @@ def _of_the_start(config: RunConfig) -> Iterator[tuple[str, str]]:
     if asked and config.data.init != "points":
         yield (
             "initializer",
-            f"--init {config.data.init} has its own points; leave out one of the two",
+            f"--init {config.data.init} has its own points; leave out one of the two options",
         )
     if config.data.points is not None and config.data.init != "points":
         yield "data.points", f"--init {config.data.init} starts from other points"

@@ -77,7 +77,7 @@ def check_own(path: Path) -> None:
             "the output path is a link or a special file, which crossgrad does not write to",
             where=path,
             found=found,
-            todo="remove it",
+            todo="remove the link or the special file",
         )
 
 
@@ -90,7 +90,7 @@ def check_new(*paths: Path) -> None:
     for path in paths:
         with disk_errors(path):
             if path.exists():
-                todo = "choose another path, or remove it"
+                todo = "choose another path, or remove the file"
                 raise UserError("the output file already exists", where=path, todo=todo)
 
 

@@ -169,5 +169,6 @@ def _unreadable(path: Path, found: str) -> UserError:
         where=path,
         expected="lines of a SHA-256 in hexadecimal digits, two spaces and a file name",
         found=found,
-        todo="restore the file from a copy, or remove it; without it the files are not checked",
+        todo="restore the file from a copy, or remove the file; then no file of the folder is "
+        "checked",
     )

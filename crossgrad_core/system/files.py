@@ -52,7 +52,7 @@ def read_only(path: Path) -> UserError:
         "crossgrad cannot write to this path",
         where=path,
         expected="a folder with write permission",
-        todo="check its permissions, or choose another path",
+        todo="check the permissions of the path, or choose another path",
     )
 
 
@@ -95,7 +95,7 @@ def disk_errors(path: Path, needed: int | None = None) -> Iterator[None]:
         if error.errno in _IN_THE_WAY:
             what, found = "another file or folder already has this name", error.strerror or ""
             raise UserError(
-                what, where=path, found=found, todo="move it to another path"
+                what, where=path, found=found, todo="move that file or folder to another path"
             ) from error
         if is_too_long(error):
             raise path_too_long(path) from error

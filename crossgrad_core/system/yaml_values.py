@@ -213,7 +213,7 @@ def _float(text: str) -> float:
     # YAML's `.inf` is `inf` in Python.
     value = float(text.replace(".", "", 1) if text.lower().endswith((".inf", ".nan")) else text)
     if isnan(value):
-        raise ValueError("a value is NaN, which no setting can be")
+        raise ValueError("a value is NaN, which is not allowed in settings")
     return value
 
 

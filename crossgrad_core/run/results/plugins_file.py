@@ -217,6 +217,6 @@ def _found(package: str) -> str:
     from importlib.metadata import PackageNotFoundError, version
 
     try:
-        return f"{package} {version(package)}, which does not contain them"
+        return f"{package} {version(package)}, which does not contain these components"
     except (PackageNotFoundError, ValueError):
         return f"package {package} is not installed"

@@ -93,7 +93,9 @@ def read_run(folder: Path) -> RunResults:
     Raises:
         UserError: The folder is not a run, or one of its files is damaged.
     """
-    check_unchanged(folder, _READ, f"restore it, or repair it with crossgrad run --resume {folder}")
+    check_unchanged(
+        folder, _READ, f"restore the file, or repair it with crossgrad run --resume {folder}"
+    )
     summary = read_summary(folder) if (folder / SUMMARY).is_file() else None
     views = () if summary is None else read_per_view(folder)
     return RunResults(folder, read_config(folder), read_metrics(folder), summary, views)

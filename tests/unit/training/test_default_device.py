@@ -100,7 +100,7 @@ def test_the_cpu_is_used_if_the_gpu_rasterizer_does_not_work(on_a_gpu, error, wh
 @pytest.mark.parametrize(
     ("settings", "why"),
     [
-        ({"rasterizer": {"name": "numba"}}, "because rasterizer numba does not run on it"),
+        ({"rasterizer": {"name": "numba"}}, "because rasterizer numba does not run on the GPU"),
         ({"rasterizer": {"name": "gsplat"}}, "pip install 'crossgrad[gsplat]'"),
         ({"seconds": 9.0, "clock": "cpu"}, "because --clock cpu does not count the time of a GPU"),
         (
