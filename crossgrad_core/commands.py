@@ -234,7 +234,7 @@ def names(slot: str) -> list[str]:
     """Return the sorted names of all installed plugins of a slot such as `operators`.
 
     Raises:
-        KeyError: There is no such slot.
+        KeyError: The slot does not exist.
     """
     return list(entries(slot))
 

@@ -16,7 +16,7 @@ _HIGHEST: Final = 2  # stderr
 
 
 def outlast_readers() -> None:
-    """Make stdout and stderr ignore failed writes and escape characters that they cannot show.
+    """Make stdout and stderr ignore failed writes and escape characters that cannot be shown.
 
     Otherwise a closed pipe (`| head`), a lost terminal or a full disk would end hours of training
     at the next progress line. A folder name with characters outside the terminal's encoding would

@@ -76,8 +76,9 @@ class Block:
         per_primitive: True if the first dimension of every tensor is the number of primitives.
         kind: `geometry`, `appearance` or `neutral`. Granularity `kind` joins all blocks of one
             kind. The operator `dispatch` can use another operator for each kind.
-        lr: Learning rate of all tensors of the block. 0 freezes the block: its tensors get no
-            gradient, may have any type, and are used in topology edits and checkpoints only.
+        lr: Learning rate of all tensors of the block. The rate 0 freezes the block: its tensors get
+            no gradient and may have any type. Only topology edits and checkpoints use frozen
+            tensors.
         rests: True if the block's tensors hold details of the colour, such as spherical harmonics
             of higher degrees, that need not be updated in every step.
     """
@@ -179,7 +180,7 @@ class PluginState:
 
 def carried(old: Tensor, source: Tensor, fresh: Tensor) -> Tensor:
     """Return the rows of `old` at `source` [M]; rows marked in `fresh` [M] are zero."""
-    # A plugin may store its tensors on another device than the run.
+    # Move the indices, because a plugin may store its tensors on another device than the run.
     source, fresh = source.to(old.device), fresh.to(old.device)
     # `index_select` copies whole rows; indexing with a tensor copies single elements.
     new = old.index_select(0, source)
@@ -189,8 +190,8 @@ def carried(old: Tensor, source: Tensor, fresh: Tensor) -> Tensor:
     return new
 
 
-#: The empty state of a plugin that has not stored a state yet. It is read-only, because all runs of
-#: a process share it.
+#: The empty state of a plugin that has not stored a state yet. The state is read-only, because all
+#: runs of a process share this object.
 EMPTY_STATE = PluginState(MappingProxyType({}), MappingProxyType({}), MappingProxyType({}))
 
 

@@ -337,8 +337,8 @@ class DensifyContext(StepContext):
         backbone: The backbone.
         rasterizer: The rasterizer, for statistics of views that this step did not render.
         views: The rendered views of the step with their screen statistics.
-        share: Number of `views` divided by the number of all views of the step; it is 1 unless
-            `--densify-views` changes it.
+        share: Number of `views` divided by the number of all views of the step; the quotient is 1
+            unless the user sets `--densify-views`.
         means_lr: Current learning rate of the primitives' positions.
         room: Number of primitives that may still be added (`--max-gaussians`, memory guard).
         may_grow: [P] bool, True for primitives that may be cloned or split; None if all may.

@@ -169,9 +169,9 @@ class Screen:
             Each bin contains 5 numbers about its pixels whose gradient is not 0. The first two
             numbers are the sum of the gradients' directions (x and y). A direction is the unit
             vector of the gradient in NDC units, that is, of the gradient times width and height.
-            The next two numbers are the sums of |x| and |y| of the gradients in pixel coordinates;
-            summed over all bins they are `abs_gradient`. The last number is the number of pixels
-            with a gradient that is not 0.
+            The next two numbers are the sums of |x| and |y| of the gradients in pixel coordinates.
+            The sum of these two numbers over all bins is `abs_gradient`. The last number is the
+            number of pixels with a gradient that is not 0.
         count: Function [H, W] bool -> [N] int32: the number of marked pixels in which each Gaussian
             was blended; None unless requested. The function keeps data of the render in memory.
         rows: [R] int64, sorted; contains every Gaussian with a radius above 0. None if the

@@ -224,7 +224,7 @@ def _kinds(
         "neutral": "neutral",
         "all": "neutral",
     }
-    # Look up the blocks themselves, because a block may have the name of a group.
+    # Use the names of the blocks as keys, because a block may have the same name as a group.
     if granularity in {"block", "gaussian"}:
         kind_by_name = {block.name: block.kind for block in blocks}
     return tuple(map(kind_by_name.__getitem__, names))

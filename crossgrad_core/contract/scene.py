@@ -142,8 +142,8 @@ _MOST: Final = 0.1
 #: A camera is stray if its distance from the median camera centre exceeds the distances of all
 #: other cameras and of most points by this factor.
 _FAR: Final = 10.0
-#: Quantile of the points' distances. It is used instead of the maximum, because single points may
-#: also be stray.
+#: Quantile of the points' distances. The quantile is used instead of the maximum, because single
+#: points may also be stray.
 _OF_POINTS: Final = 0.9
 
 
@@ -460,7 +460,7 @@ def is_in_image(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.bool_
 
 
 def masked(image: Tensor, mask: Tensor | None) -> Tensor:
-    """Return the image [H, W, C] with 0 at masked-out pixels, even if they contain NaN."""
+    """Return the image [H, W, C] with 0 at masked-out pixels; a NaN there is replaced, too."""
     if mask is None:
         return image
     return torch.where(mask.unsqueeze(-1), image, image.new_zeros(()))

@@ -134,8 +134,8 @@ SHORT = 3_000
 SHORTEST_WARM_UP = 500
 #: Shortest interval over which growth statistics are collected (the published interval).
 SHORTEST_INTERVAL = 100
-#: Shortest interval of anchor growing. It is half the published interval, because short runs grow
-#: too few anchors with the published interval (docs/benchmarks.md).
+#: Shortest interval of anchor growing. The number is half the published interval, because short
+#: runs grow too few anchors with the published interval (docs/benchmarks.md).
 SHORTEST_ANCHOR_INTERVAL = 50
 #: Runs with fewer steps than this number make no opacity reset, because they are too short to
 #: recover from a reset.

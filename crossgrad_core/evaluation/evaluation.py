@@ -1,8 +1,7 @@
 """Evaluation of held-out views: metrics of each view, means overall and per regime, and PSNR.
 
-Both images are clamped to [0, 1] and rounded to 8 bits per channel before the comparison, as if the
-render had been written to a file and read back. Masked pixels do not count. Metrics are means over
-images.
+Before the comparison, the render and the photo are clamped to [0, 1] and rounded to 8 bits per
+channel, as in image files. Masked pixels do not count. Metrics are means over images.
 
 Source: 3DGS evaluation scripts.
 """
@@ -98,7 +97,8 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | N
     )
     if rendered.numel() == 0:
         return None
-    # Squares and sums are whole numbers, which float32 and float64 represent exactly.
+    # This sum is exact, because squares and sums are whole numbers that float32 and float64 can
+    # represent.
     total = 0.0
     for ours, theirs in zip(
         *(torch.split(pixels, _AT_ONCE) for pixels in (rendered, photo)), strict=True

@@ -57,7 +57,7 @@ class EvaluationResult:
         views: Metrics of each view, in the order of the scene.
         overall: Means over all views.
         regimes: Regime -> means over its views, sorted by name.
-        reasons: Name of a metric -> reason why it is null.
+        reasons: Name of a metric -> reason why the metric is null.
     """
 
     figures: tuple[Figure, ...]

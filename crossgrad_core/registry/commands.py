@@ -25,7 +25,8 @@ def load_command(entry: Entry) -> Command:
     """Return the typer app or function that an entry point names; its module is imported first.
 
     Raises:
-        UserError: The object cannot be imported, or it is another kind of object.
+        UserError: The object cannot be imported, or the object is neither a typer app nor a
+            function.
     """
     command = resolve_entry(entry)
     if isinstance(command, typer.Typer) or inspect.isfunction(command):
@@ -74,7 +75,7 @@ def _source(module: str) -> bytes:
     """Return the source of a module; unlike `importlib.util.find_spec`, import no parent package.
 
     Raises:
-        FileNotFoundError: There is no such module.
+        FileNotFoundError: The module does not exist.
     """
     parts = module.split(".")
     path: list[str] | None = None

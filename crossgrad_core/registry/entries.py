@@ -1,8 +1,8 @@
 """Plugins by name: listed from package metadata, imported only when a run needs them.
 
 Listing reads entry points and imports no plugin, no torch and no pydantic. Loading never fails
-silently. It raises an error if a name is unknown, if two distributions offer the name, if the
-plugin fails to import, or if the plugin has the wrong kind. The error names the plugin and its
+silently. Loading raises an error if a name is unknown, if two distributions offer the name, if the
+plugin cannot be imported, or if the plugin has a wrong type. The error names the plugin and its
 distribution.
 """
 
@@ -79,7 +79,7 @@ def offers(slot: str) -> tuple[Entry, ...]:
     """Return all installed entries of a slot, sorted by name; a name may occur twice.
 
     Raises:
-        KeyError: There is no such slot.
+        KeyError: The slot does not exist.
     """
     return _offers(tuple(sys.path))[slot]
 
@@ -88,7 +88,7 @@ def entries(slot: str) -> dict[str, Entry]:
     """Return name -> entry for a slot. No plugin is imported.
 
     Raises:
-        KeyError: There is no such slot.
+        KeyError: The slot does not exist.
     """
     return {entry.name: entry for entry in offers(slot)}
 
@@ -131,8 +131,9 @@ def load(slot: "str | type[Component]", name: str) -> "type[Component]":
         name: Name of the plugin.
 
     Raises:
-        UserError: The name is unknown or ambiguous; the plugin fails to import; the plugin is not a
-            complete subclass of the slot's base class; or its methods take other arguments.
+        UserError: The name is unknown or ambiguous, or the plugin cannot be imported. Also if the
+            plugin is not a complete subclass of the slot's base class, or if its methods take other
+            arguments.
     """
     return load_entry(find(slot if isinstance(slot, str) else slot.slot, name))
 

@@ -1,8 +1,8 @@
 """One plugin manager per run, and calls of first-result hooks, which must return a result.
 
-pluggy does not report an unknown hook, a hook method without its marker, or a second plugin that
-answers a first-result hook. This module reports these three mistakes as errors that name the
-plugin.
+The library pluggy does not report an unknown hook, a hook method without its marker, or a second
+plugin that answers a first-result hook. This module reports these three mistakes as errors that
+name the plugin.
 """
 
 import inspect
@@ -66,7 +66,7 @@ def make_manager(plugins: Mapping[str, object]) -> pluggy.PluginManager:
 
     Raises:
         UserError: A plugin has a hook that does not exist, a hook method without `@hookimpl`, or a
-            hook method with wrong arguments; or two plugins answer the same first-result hook.
+            hook method with wrong arguments. Also if two plugins answer the same first-result hook.
     """
     manager = _Manager(PROJECT)
     manager.add_hookspecs(HookSpecs)

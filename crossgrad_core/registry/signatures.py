@@ -24,7 +24,7 @@ def wrong_signatures(found: type, base: type) -> tuple[tuple[str, str, str], ...
         found: A subclass of `base`.
         base: The base class of a slot.
 
-    Returns: Name, signature in the base class and actual signature, for each such method.
+    Returns: Name, signature in the base class and actual signature, for each wrong method.
     """
     contract = [ancestor for ancestor in base.__mro__ if ancestor.__module__.startswith(_CONTRACT)]
     names = dict.fromkeys(name for ancestor in contract for name in vars(ancestor))

@@ -30,7 +30,7 @@ def as_user_error(
     details = error.errors(include_url=False)
     first, places = details[0], [_place(model, detail["loc"]) for detail in details]
     option_path, holder = places[0]
-    # A value that fits no branch of a union is reported once for each branch.
+    # Join the errors of one option, because pydantic reports one error for each branch of a union.
     branches = [detail for detail, at in zip(details, places, strict=True) if at[0] == option_path]
     key, *others = dict.fromkeys(".".join(parts) for parts, _ in places)
     more = f"also wrong: {listed(others)}" if others else ""

@@ -318,8 +318,8 @@ def _tried_out() -> Iterator[None]:
     """
     try:
         yield
-    # Numerical or memory problems can cause these errors. Any other error is a bug of crossgrad, so
-    # keep its traceback.
+    # Numerical or memory problems can cause errors of these types, so convert them to user errors.
+    # Any other error is a bug of crossgrad, so keep its traceback.
     except (TrainingFailedError, NonFiniteError, RuntimeError, ValueError, MemoryError) as error:
         if isinstance(error, UserError) or failed_plugin(error):
             raise

@@ -221,7 +221,8 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
 def _photos(config: RunConfig) -> ScaledPhotos | DevicePhotos:
     """Return the cache of reduced photos, and on a GPU also the cache of photos in GPU memory."""
     mib, device = config.data.cache_mib, choose_device(config.device)
-    # Photos of half the side length use a quarter of the memory.
+    # Use a quarter of the limit, because photos of half the side length use a quarter of the
+    # memory.
     scaled = ScaledPhotos(mib // 4)
     return scaled if device.type == "cpu" else DevicePhotos(scaled, device, mib)
 

@@ -186,7 +186,7 @@ def check_json(value: object, where: str) -> None:
     """Refuse values that JSON would change: keys that are not text, tuples and arrays.
 
     Raises:
-        UserError: Such a value exists; the message names its position.
+        UserError: JSON would change a value; the message names the position of the value.
     """
     if wrong := no_json(value):
         raise UserError(
@@ -290,7 +290,7 @@ def pack(checkpoint: "Checkpoint") -> dict[str, Tensor]:
         owned = tensor.detach().cpu().contiguous()
         storage = owned.untyped_storage()
         partial = storage.nbytes() != owned.numel() * owned.element_size()
-        # safetensors refuses tensors that share memory.
+        # Clone the tensor, because safetensors refuses tensors that share memory.
         if partial or storage.data_ptr() in storages:
             owned = owned.clone()
         storages.add(owned.untyped_storage().data_ptr())
@@ -340,7 +340,7 @@ def write_tensors(path: Path, packed: dict[str, Tensor]) -> None:
         path.touch()
         mode = path.stat().st_mode
         save_file(packed, path)
-        # safetensors creates a new file that only its owner may read.
+        # Restore the permissions, because safetensors creates a file that only its owner may read.
         path.chmod(mode)
         sync_file(path)
     except SafetensorError as error:
@@ -360,7 +360,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     from safetensors.torch import load, load_file
 
     try:
-        # safetensors opens only files whose names are valid UTF-8.
+        # Read the bytes directly, because safetensors opens only files whose names are valid UTF-8.
         if showable(str(path)) != str(path):
             return load(path.read_bytes())
         # Clone the tensors, because safetensors maps the file and a later checkpoint may delete the
@@ -498,7 +498,7 @@ def load(folder: Path) -> Checkpoint:
         raise damaged(folder, f"{TENSORS} has changed since it was written (its SHA-256 differs)")
     try:
         packed = read_tensors(folder / TENSORS)
-        # safetensors sorts the tensors by key, but the order of the parameters must stay the same.
+        # Restore the order of the parameters, because safetensors sorts the tensors by key.
         tensors = unpack({key: packed[key] for key in state["tensors"]})
         return Checkpoint(
             step=state["step"],

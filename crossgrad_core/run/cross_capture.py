@@ -22,9 +22,9 @@ SAME_PLACE, SAME_DIRECTION = 1e-3, 1e-2
 #: Smallest share of a capture's points inside a box, and the factor that enlarges the box. The box
 #: contains the run's points and cameras.
 LEAST_SHARED, MARGIN = 0.1, 1.1
-#: Largest ratio of two median distances, and number of random rotations. The points of two captures
-#: of one place are on the same surfaces. Therefore the capture's points are much nearer to the
-#: run's points than after a random rotation about the middle of the capture.
+#: Largest accepted ratio of two median distances of points, and number of random rotations. The
+#: points of two captures of one place are on the same surfaces. Therefore the capture's points are
+#: much nearer to the run's points than after a random rotation about the middle of the capture.
 LEAST_ALIKE, TURNS = 0.4, 9
 #: Minimum number of points for the test with random rotations, maximum number of points from the
 #: other capture, and maximum number of points from the run.
@@ -69,7 +69,7 @@ def elsewhere(setup: Setup, path: Path) -> Elsewhere:
 
     Raises:
         UserError: The scene cannot be read or is in another place, or the run was trained on all
-            of its views.
+            views of the scene.
     """
     reading = {"split": "none", "masks": None, "init": "random", "points": None}
     config = setup.config.model_copy(

@@ -20,7 +20,7 @@ def choose_device(name: str) -> torch.device:
     """Return the torch device of this name.
 
     Raises:
-        UserError: There is no such device on this machine.
+        UserError: The device does not exist on this machine.
     """
     try:
         device = torch.device(name)

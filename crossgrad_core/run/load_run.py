@@ -235,7 +235,8 @@ def _check_tensors(setup: Setup, checkpoint: Checkpoint) -> None:
     missing = [name for name in wanted if name not in parameters]
     if missing:
         raise _misfit(checkpoint, f"parameters {listed(wanted)}", f"no {listed(missing)}")
-    # Frozen parameters may be whole numbers, such as the levels of an octree.
+    # Check trained parameters only, because frozen parameters may be whole numbers, such as the
+    # levels of an octree.
     trained = [name for block in setup.trained_blocks for name in block.tensors]
     whole = [name for name in trained if not parameters[name].is_floating_point()]
     if whole:

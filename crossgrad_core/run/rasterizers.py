@@ -61,8 +61,8 @@ def choose_rasterizer(name: str, wanted: Wanted) -> tuple[str, tuple[str, ...]]:
     Every installed rasterizer reports its speed on the device. The fastest rasterizer that meets
     the requirements is chosen. Among equally fast rasterizers, the first by name is chosen. If no
     rasterizer meets the requirements, the fastest rasterizer is chosen, and later checks report why
-    it cannot work. A rasterizer that cannot be imported is left out. Rasterizers slower than the
-    chosen rasterizer are not imported.
+    this rasterizer cannot work. A rasterizer that cannot be imported is left out. Rasterizers
+    slower than the chosen rasterizer are not imported.
 
     Args:
         name: The user's choice; `auto` if the user did not choose a rasterizer.
@@ -90,7 +90,7 @@ def choose_rasterizer(name: str, wanted: Wanted) -> tuple[str, tuple[str, ...]]:
 
 
 def fastest_able(speeds: Mapping[str, float], wanted: Wanted, notes: list[str]) -> str | None:
-    """Return the fastest rasterizer that meets the requirements; None without such a rasterizer.
+    """Return the fastest rasterizer that meets the requirements; None if no rasterizer does.
 
     Args:
         speeds: Name -> speed.

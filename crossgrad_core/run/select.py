@@ -224,7 +224,7 @@ def _grouping_choice(
 ) -> ComponentChoice | None:
     if config.grouping is not None and config.grouping.name != AUTO:
         return config.grouping
-    # A sampler that makes its own labels needs no grouping.
+    # Ignore the operator's default grouping if the sampler makes its own labels.
     of_operator = None if sampler.own_labels else operator.resolved_grouping
     name = sampler.default_grouping or of_operator
     if name is not None:

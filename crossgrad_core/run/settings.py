@@ -98,7 +98,8 @@ def layered(layers: Sequence[Mapping[str, object]], assignments: Sequence[str] =
         layers: Name of an option of `crossgrad run`, or key of a configuration file -> value. A
             layer that chooses another component drops the options that earlier layers gave to the
             previous component. A length replaces all lengths of earlier layers.
-        assignments: `KEY=VALUE` texts as after `--set`, values in YAML; they override all layers.
+        assignments: `KEY=VALUE` texts as after `--set`, values in YAML. Assignments override all
+            layers.
 
     Raises:
         UserError: An assignment, or a key with a dot, is malformed.
@@ -116,7 +117,7 @@ def with_recipe(settings: Mapping[str, Any]) -> Settings:
     A configuration that a run wrote already contains the fixed settings.
 
     Raises:
-        UserError: There is no such recipe.
+        UserError: The recipe does not exist.
     """
     choice = settings.get("recipe")
     if not isinstance(choice, Mapping) or "name" not in choice or settings.get("decided"):

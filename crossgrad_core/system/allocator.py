@@ -15,8 +15,8 @@ MMAP_THRESHOLD: Final = -3
 KEPT: Final = 512 << 20
 LARGEST: Final = 32 << 20
 #: Number of bytes by which the heap grows at first, and number of bytes by which it grows later.
-#: The first growth is smaller than `KEPT`, so that glibc does not return it to the system at once.
-#: glibc returns the heaps of other threads to the system only in pieces of the later size.
+#: The first growth is smaller than `KEPT`, so that glibc does not return this memory to the system
+#: at once. glibc returns the heaps of other threads to the system only in pieces of the later size.
 FIRST: Final = KEPT - 2 * LARGEST
 LATER: Final = 16 << 20
 #: Size of a large page in bytes, and the `madvise` constant for large pages, which the module

@@ -36,8 +36,8 @@ _TYPES = {
     "float64": "f8",
 }
 _FORMATS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
-# `isdigit` would also accept digits of other scripts. More than 18 digits are refused, because no
-# file contains 10^18 records.
+# Use a pattern, because `isdigit` would also accept digits of other scripts. More than 18 digits
+# are refused, because no file contains 10^18 records.
 _COUNT = re.compile(r"[0-9]{1,18}")
 _LONGEST_HEADER_LINE = 65_536
 _MOST_HEADER_LINES = 10_000
@@ -232,7 +232,7 @@ def _read_binary(
         found = f"{size_text(max(there, 0))} ({max(there, 0):,} bytes)"
         expected = f"{size_text(needed)} ({needed:,} bytes) for {vertex.count:,} vertices"
         raise _truncated(path, expected, found)
-    if dtype.itemsize == 0:  # An element without properties takes no space.
+    if dtype.itemsize == 0:  # An element without properties contains no data.
         return {}
     file.seek(start)
     rows = np.fromfile(file, dtype=dtype, count=vertex.count)

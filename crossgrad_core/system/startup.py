@@ -139,7 +139,7 @@ def _say(text: str, *, stays: bool = True) -> None:
         stream.write(f"{clear}{one_line(text)}" + ("\n" if stays else ""))
         stream.flush()
     except (OSError, ValueError):
-        pass  # The program that reads the output has closed it.
+        pass  # The program that reads the output has closed the stream.
 
 
 class Progress:

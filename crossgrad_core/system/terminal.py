@@ -63,5 +63,5 @@ def is_live(stream: TextIO) -> bool:
         return False
     try:
         return os.get_terminal_size(stream.fileno()).columns > 0
-    except (OSError, ValueError):  # The terminal does not report its size.
+    except (OSError, ValueError):  # A terminal that does not report its size counts as live.
         return True

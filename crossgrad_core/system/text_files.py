@@ -12,7 +12,8 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.system.files import text_bytes, write_atomically
 from crossgrad_core.system.input_files import LARGEST, read_file
 
-# `int` and `float` also accept digits of other scripts, digit groups and spaces.
+# Check numbers with a pattern, because `int` and `float` also accept digits of other scripts, digit
+# groups and spaces.
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?inf|nan", re.ASCII)
 _LONGEST_NUMBER = 400
 # Estimated bytes of memory for each of these characters in a file. In CSV, a line end adds a list,
@@ -55,7 +56,7 @@ def read_json(path: Path, most: int = LARGEST) -> object:
         most: Maximum size of the file in bytes.
 
     Raises:
-        FileNotFoundError: There is no such file.
+        FileNotFoundError: The file does not exist.
         ValueError: The file cannot be read, is too large or too deeply nested, or is not JSON.
     """
     try:

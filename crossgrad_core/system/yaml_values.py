@@ -75,7 +75,8 @@ class _Dumper(yaml.SafeDumper):
 
 
 def _represented(dumper: _Dumper, text: str) -> ScalarNode:
-    # In other styles, PyYAML writes Unicode line ends unescaped and reads them as spaces.
+    # Use double quotes for text with line ends, because PyYAML otherwise writes Unicode line ends
+    # unescaped and reads these line ends as spaces.
     style = '"' if _LINE_ENDS.search(text) else None
     return dumper.represent_scalar(f"{_TAG}str", text, style)
 
@@ -210,7 +211,7 @@ def _integer(text: str) -> int:
 
 
 def _float(text: str) -> float:
-    # YAML's `.inf` is `inf` in Python.
+    # Remove the dot, because YAML's `.inf` is `inf` in Python.
     value = float(text.replace(".", "", 1) if text.lower().endswith((".inf", ".nan")) else text)
     if isnan(value):
         raise ValueError("a value is NaN, which is not allowed in settings")

@@ -22,7 +22,7 @@ class Backbone(Component):
     """A trained representation: parameters in named blocks, decoded to Gaussians for a camera.
 
     Attributes:
-        default_densifier: Name of the densifier that is used unless the user names another. A
+        default_densifier: Name of the densifier that is used if the user names no densifier. A
             recipe may choose another densifier, for example in short runs of many photos.
         response: Formula of a Gaussian's opacity in a pixel.
         plain: True if the backbone decodes to the same plain Gaussians for every camera, so that a
@@ -34,7 +34,7 @@ class Backbone(Component):
             of the tensor need to be up to date. Subclasses do not inherit this value.
         positions: Name of the tensor [N, 3] of the primitives' positions in the local frame. Before
             the first step and after steps with edits, the primitives are sorted in memory by
-            position: all rows of all per-primitive tensors are sorted together, and `prepare` is
+            position. The rows of all per-primitive tensors are sorted together, and `prepare` is
             not called. At the end of a run, the rows of floaters may be removed from all these
             tensors. To find floaters, `decode` is called with some of the rows only. If the name is
             empty, only edits move or remove rows.
@@ -57,10 +57,12 @@ class Backbone(Component):
     @classmethod
     @override
     def __pydantic_init_subclass__(cls, **kwargs: object) -> None:
-        # The `decode` of a subclass may read a tensor that the parent's `decode` does not read.
+        # Do not inherit `passthrough`, because the `decode` of a subclass may read a tensor that
+        # the parent's `decode` does not read.
         if "passthrough" not in vars(cls):
             cls.passthrough = {}
-        # A subclass may store standard deviations and rotations in another form.
+        # Do not inherit `axes`, because a subclass may store standard deviations and rotations in
+        # another form.
         if "axes" not in vars(cls):
             cls.axes = ()
 

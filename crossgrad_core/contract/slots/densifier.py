@@ -56,8 +56,8 @@ class Densifier(Component):
     def densify(self, context: DensifyContext, state: PluginState) -> tuple[Edit, PluginState]:
         """Return the edit of this step and the new state.
 
-        An edit must keep at least a tenth of the primitives of a model that trains well, because a
-        model does not recover from the loss of nearly all primitives.
+        An edit must keep at least a tenth of the primitives of a model that trains well. A model
+        does not recover from the loss of nearly all primitives.
 
         The core applies the edit to the rows of `per_primitive` in the *returned* state, too.
         """

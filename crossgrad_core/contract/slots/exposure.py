@@ -52,8 +52,8 @@ class Exposure(Component):
     The parameters of an exposure belong to photos, not to the scene, so operators do not receive
     their gradients. After each step, the values of each photo in this step are updated by a
     separate Adam step with its own step count. The separate step is the same for any number of
-    views and every backbone. After it, `project` limits the values of all photos. Checkpoints
-    contain the values.
+    views and every backbone. After the separate step, `project` limits the values of all photos.
+    Checkpoints contain the values.
     """
 
     slot: ClassVar[str] = "exposures"

@@ -48,8 +48,8 @@ class Rasterizer(Component):
     @classmethod
     @override
     def __pydantic_init_subclass__(cls, **kwargs: object) -> None:
-        # A subclass may read rows of Gaussians before its parent class requests an update of these
-        # rows.
+        # Do not inherit `sparse_rows`, because a subclass may read rows of Gaussians before its
+        # parent class requests an update of these rows.
         if "sparse_rows" not in vars(cls):
             cls.sparse_rows = False
 

@@ -21,8 +21,8 @@ class Reader(Component):
     def nearly_accepts(self, path: Path) -> bool:
         """Return True if a file in the folder has almost the format of this reader.
 
-        This method is called only if no reader accepts the folder. If it returns True, `read`
-        reports what is missing.
+        This method is called only if no reader accepts the folder. If the result is True, the error
+        message of `read` reports what is missing.
         """
         return False
 

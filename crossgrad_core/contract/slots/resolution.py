@@ -31,9 +31,9 @@ class Resolution(Component):
     statistics in units of the full photo.
 
     Attributes:
-        strided: True if a view of scale 1 / n is rendered at one pixel of each n x n block instead,
-            and compared with these pixels of its photo. The rendered pixel of a block differs from
-            step to step.
+        strided: True if a view of scale 1 / n is rendered at one pixel of each n x n block of the
+            full-size image. The loss compares these pixels with the same pixels of the photo. The
+            rendered pixel of a block differs from step to step.
     """
 
     slot: ClassVar[str] = "resolutions"

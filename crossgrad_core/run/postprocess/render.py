@@ -42,7 +42,8 @@ def render(
         split: The views to render: test, train or all.
         out: Folder of the pictures; by default a folder inside the run's folder.
         how: The options for opening the run.
-        on: Folder of another capture of the same place, whose views are rendered instead.
+        on: Folder of another capture of the same place, whose views are rendered instead of the
+            run's views.
 
     Raises:
         UserError: The folder is not a run, the run has no checkpoint, or the split is empty. Also

@@ -83,7 +83,7 @@ def _lines(rows: Sequence[Row], views: Mapping[str, int]) -> list[_Line]:
     lines = [_Line(_labelled(_OVERALL, "", rows[-1], views), "")]
     regimes = [name for name in sorted(views) if name != _OVERALL and f"psnr_{name}" in rows[0]]
     looks = zip(cycle(_COLORS), cycle(_MARKERS), cycle(_STYLES), strict=False)
-    if len(regimes) > 1:  # The curve of a single regime would be equal to the curve `overall`.
+    if len(regimes) > 1:  # The curve of a single regime is equal to the curve `overall`.
         for name, look in zip(regimes, looks, strict=False):
             lines.append(_Line(_labelled(name, f"_{name}", rows[-1], views), f"_{name}", *look))
     return lines

@@ -43,7 +43,7 @@ def restored(folder: Path, scalars: Mapping[str, Any], step: int) -> tuple[str, 
     text = (scalars.get(KEY) or {}).get(METRICS)
     present = _content(folder / METRICS)
     if text is None or present == text.encode():
-        return ()  # The file did not exist when the checkpoint was written, or it is complete.
+        return ()  # The checkpoint contains no copy of the file, or the file is equal to the copy.
     write_atomically(folder / METRICS, text.encode())
     if present is not None and present.startswith(text.encode()):
         return ()

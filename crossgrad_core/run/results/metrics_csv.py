@@ -180,7 +180,7 @@ def _append(path: Path, content: bytes) -> None:
         size = file.tell()
         try:
             left = memoryview(content)
-            while left:  # The system may write only a part of the data.
+            while left:  # One call may write only a part of the data.
                 left = left[file.write(left) :]
             os.fsync(file.fileno())
         except OSError:
