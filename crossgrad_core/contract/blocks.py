@@ -74,8 +74,8 @@ class Block:
         tensors: Names of the block's tensors in `Parameters`. A block with one tensor uses the
             tensor's name.
         per_primitive: True if the first dimension of every tensor is the number of primitives.
-        kind: `geometry`, `appearance` or `neutral`. Granularity `kind` joins all blocks of one
-            kind. The operator `dispatch` can use another operator for each kind.
+        kind: `geometry`, `appearance` or `neutral`. With granularity `kind`, all blocks of one kind
+            share one Gramian. The operator `dispatch` can use another operator for each kind.
         lr: Learning rate of all tensors of the block. The rate 0 freezes the block: its tensors get
             no gradient and may have any type. Only topology edits and checkpoints use frozen
             tensors.

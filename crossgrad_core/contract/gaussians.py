@@ -53,8 +53,8 @@ class Gaussians:
         decoded: [P] bool, the primitives that were decoded for this view, with or without a
             resulting Gaussian; None if all were decoded.
         on_demand: Tensors whose rows must be requested before they are read. The gradients of these
-            tensors are sparse, by rows. None if all rows are up to date. Only rasterizers with
-            `sparse_rows` receive this field.
+            tensors are sparse tensors of whole rows. None if all rows are up to date. Only
+            rasterizers with `sparse_rows` receive this field.
     """
 
     means: Tensor

@@ -214,7 +214,8 @@ def operator_context(
 def _kinds(
     names: Sequence[str], blocks: Sequence[Block], granularity: Granularity
 ) -> tuple[BlockKind, ...]:
-    """Return the kinds of blocks.
+    """Return the kind of each block, or of each group of blocks.
+
 
     A group of blocks is named by its kind; the group `all` is neutral.
     """

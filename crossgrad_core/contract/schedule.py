@@ -137,7 +137,7 @@ SHORTEST_INTERVAL = 100
 #: Shortest interval of anchor growing. The number is half the published interval, because short
 #: runs grow too few anchors with the published interval (docs/benchmarks.md).
 SHORTEST_ANCHOR_INTERVAL = 50
-#: Runs with fewer steps than this number make no opacity reset, because they are too short to
+#: Runs with a length below this number make no opacity reset, because these runs are too short to
 #: recover from a reset.
 SHORTEST_RUN_WITH_RESET = 10_000
 #: If edits are counted in views, an interval is one pass over the training photos. The interval is

@@ -60,7 +60,7 @@ def resume(
     verbose: bool = False,
     **options: object,
 ) -> Run:
-    """Continue a stopped run; the results are bitwise equal to an uninterrupted run.
+    """Continue a stopped run; an uninterrupted run would have bitwise equal results.
 
     Args:
         folder: The run's folder.

@@ -331,7 +331,7 @@ def _linear_note(setup: Setup) -> tuple[str, ...]:
         return (
             (
                 f"gradients of single views are stored for {', '.join(setup.watchers)} (the "
-                "result has the same bits)"
+                f"training result is bitwise equal)"
             ),
         )
     return (

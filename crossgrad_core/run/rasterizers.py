@@ -135,7 +135,7 @@ def drawn_elsewhere(config: RunConfig) -> RunConfig:
 def speeds_on(device: str) -> tuple[dict[str, float], list[str]]:
     """Return name -> speed of a device's rasterizers, and notes on broken rasterizers.
 
-    A rasterizer with a quick function for its speed is not imported.
+    A rasterizer whose package declares a separate speed function is not imported.
     """
     speeds: dict[str, float] = {}
     notes = []
