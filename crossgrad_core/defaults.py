@@ -12,7 +12,8 @@ OPERATOR: Final = "sum"
 LOSS: Final = "l1-ssim"
 #: Initializer that adds no points, for published runs and for runs whose points come from a file.
 PLAIN_INITIALIZER: Final = "points"
-#: Initializer that finds points for a scene without points. Messages contain its name.
+#: Initializer that finds points for a scene without points. Messages to users contain the name of
+#: this initializer.
 INITIALIZER_WITHOUT_POINTS: Final = "triangulated"
 RESOLUTION: Final = "full"
 #: The exporter also reads the file of `--init FILE.ply`.

@@ -216,7 +216,6 @@ def _kinds(
 ) -> tuple[BlockKind, ...]:
     """Return the kind of each block, or of each group of blocks.
 
-
     A group of blocks is named by its kind; the group `all` is neutral.
     """
     kind_by_name: dict[str, BlockKind] = {

@@ -53,7 +53,7 @@ class EvaluationResult:
     """The results of an evaluation.
 
     Attributes:
-        figures: The measured metrics, in the order of all tables.
+        figures: The measured metrics, in their order in all tables.
         views: Metrics of each view, in the order of the scene.
         overall: Means over all views.
         regimes: Regime -> means over its views, sorted by name.

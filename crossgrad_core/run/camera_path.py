@@ -134,7 +134,7 @@ def _way(share: float, nearer: float) -> float:
 
 
 def _between(first: Camera, last: Camera, share: float, nearer: float) -> Camera:
-    """Return the camera at a share of the frames; direction and field of view change evenly."""
+    """Return the camera after a share of all frames; direction and field of view change evenly."""
     ends = first.world_to_camera.numpy(), last.world_to_camera.numpy()
     down, ahead = ((1.0 - share) * ends[0][row, :3] + share * ends[1][row, :3] for row in (1, 2))
     forward = _unit(ahead)

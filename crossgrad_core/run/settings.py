@@ -29,7 +29,7 @@ Settings: TypeAlias = dict[str, Any]
 
 #: Setting that contains a list of components -> the option that adds a component to the list.
 ADDING: Final = {"observers": "--observe", "metrics": "--metrics"}
-#: Settings that name one component (or a chain of operators) and contain its options.
+#: Settings that contain the name and the options of a component, or of a chain of operators.
 CHOICES: Final = tuple(singular(slot) for slot in GROUPS if slot not in MANY)
 #: Settings that determine the length of a run.
 LENGTHS: Final = tuple(

@@ -158,12 +158,12 @@ def _of_the_schedule(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str
     if config.clock == "cpu" and not (config.seconds or config.planned_seconds):
         yield "clock", "the length of the run is not given in seconds; add --seconds"
     stop, total = config.stop_after, setup.schedule.total
-    # Accept any step in a run with a time budget, because the run may become longer.
+    # Accept any `stop_after` in a run with a time budget, because the run may become longer.
     if stop is not None and stop > total and not (config.seconds or config.planned_seconds):
         yield "stop_after", f"the run ends after step {total}"
     if config.min_refinements and not setup.schedule.min_refinements:
-        why = "published or set by the user are not adapted"
-        yield "min_refinements", f"densification times that are counted in steps, {why}"
+        why = "published times and times set by the user are not adapted"
+        yield "min_refinements", f"densification times in steps, {why}"
     yield from _of_harmonics(config, setup)
 
 

@@ -19,7 +19,7 @@ from crossgrad_core.system.input_files import open_file, read_file
 from crossgrad_core.wording import one_line
 
 _LOG = logging.getLogger(__name__)
-#: The name of the file in a folder of results.
+#: Name of the file with the digests in a folder of results.
 SUMS: Final = "SHA256SUMS"
 _LINE: Final = re.compile(r"([0-9a-f]{64})  (.+)")
 #: Characters that would need escapes in SHA256SUMS. The file does not list names with these

@@ -16,9 +16,9 @@ from crossgrad_core.system.input_files import LARGEST, read_file
 # groups and spaces.
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?inf|nan", re.ASCII)
 _LONGEST_NUMBER = 400
-# Estimated bytes of memory for each of these characters in a file. In CSV, a line end adds a list,
-# and a comma adds a cell. In JSON, `[` adds a list, `{` adds an object, and `,` and `:` add a
-# value.
+# Estimated bytes of memory for each of these characters in a file. In CSV, each line end stands for
+# a list, and each comma for a cell. In JSON, each `[` stands for a list, each `{` for an object,
+# and each `,` or `:` for a value.
 _CSV = {b"\n": 160, b"\r": 160, b",": 60}
 _JSON = {b"[": 96, b"{": 240, b",": 64, b":": 64}
 

@@ -68,7 +68,7 @@ class Machine:
 
     @hookimpl
     def crossgrad_step_end(self, record: StepRecord) -> None:
-        """Record the load, at most once per second."""
+        """Record the load of the machine, at most once per second."""
         now = perf_counter()
         if now - self._looked >= LOOK_SECONDS and hasattr(os, "getloadavg"):
             self._looked = now

@@ -14,8 +14,8 @@ from crossgrad_core.system.checksums import changed_files
 from crossgrad_core.system.files import write_atomically
 from crossgrad_core.system.input_files import read_file
 
-#: Advice for the user by the most serious difference of the scene. The key None means that the user
-#: can accept the difference.
+#: Most serious difference of the scene -> advice for the user. The key None stands for differences
+#: that the user can accept.
 _WAYS_OUT = {
     None: "restore the scene, or add --accept-scene to continue with the changed scene",
     Weight.HELD_OUT: (
