@@ -341,7 +341,8 @@ class DensifyContext(StepContext):
             unless the user sets `--densify-views`.
         means_lr: Current learning rate of the primitives' positions.
         room: Number of primitives that may still be added (`--max-gaussians`, memory guard).
-        may_grow: [P] bool, True for primitives that may be cloned or split; None if all may.
+        may_grow: [P] bool, True for primitives that may be cloned or split; None if all primitives
+            may.
         render: Renders a training view that the densifier chooses. The render counts as training
             time and as a rendered view.
     """

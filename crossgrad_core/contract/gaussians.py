@@ -173,7 +173,8 @@ class Screen:
             The sum of these two numbers over all bins is `abs_gradient`. The last number is the
             number of pixels with a gradient that is not 0.
         count: Function [H, W] bool -> [N] int32: the number of marked pixels in which each Gaussian
-            was blended; None unless requested. The function keeps data of the render in memory.
+            was blended; None unless requested. The data of the render stay in memory as long as
+            this function exists.
         rows: [R] int64, sorted; contains every Gaussian with a radius above 0. None if the
             rasterizer provides no such list.
     """

@@ -486,7 +486,7 @@ def drop_later(run: Path, step: int) -> None:
 
 
 def load(folder: Path) -> Checkpoint:
-    """Read a checkpoint folder: on the CPU, without gradients, bit for bit as it was saved.
+    """Return the checkpoint in a folder, with bitwise unchanged tensors on the CPU.
 
     Raises:
         UserError: The checkpoint is missing, incomplete, damaged, or of another format version.

@@ -63,5 +63,8 @@ def is_live(stream: TextIO) -> bool:
         return False
     try:
         return os.get_terminal_size(stream.fileno()).columns > 0
-    except (OSError, ValueError):  # A terminal that does not report its size counts as live.
+    except (
+        OSError,
+        ValueError,
+    ):  # Assume that a terminal without a known size can overwrite lines.
         return True
