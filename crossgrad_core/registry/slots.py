@@ -43,9 +43,8 @@ OFFERED: Final[dict[str, str]] = {**GROUPS, COMMANDS: f"crossgrad.{COMMANDS}"}
 #: The group of planners, which decide settings of a run from its scene (`--plan`). This group is
 #: not a slot of a run.
 PLANNERS: Final = "planners"
-#: Slot -> entry-point group of quick functions. The choice `auto` calls these functions instead of
-#: `accepts` of a reader and `speed` of a rasterizer, because these functions need no import of the
-#: component.
+#: Slot -> entry-point group of functions that `auto` calls without importing a component. The
+#: functions replace `accepts` of a reader and `speed` of a rasterizer.
 QUICK: Final = {
     "readers": "crossgrad.readers.accepts",
     "rasterizers": "crossgrad.rasterizers.speed",

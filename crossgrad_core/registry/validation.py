@@ -94,7 +94,10 @@ def _name(annotation: object) -> str:
 
 
 def _inside(annotation: object, part: str) -> tuple[type[BaseModel] | None, object]:
-    """Return the model `annotation`, or None for another type, and the annotation of `part`."""
+    """Return the model and the annotation of its field `part`.
+
+    For a list, a tuple or a mapping, return None and the annotation of the values.
+    """
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         field = annotation.model_fields.get(part)
         return annotation, field.annotation if field else None

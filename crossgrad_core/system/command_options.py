@@ -57,8 +57,8 @@ def command_of(
     """Return a decorator that turns a function into a command.
 
     Args:
-        options: A dataclass whose fields are `argument`s and `option`s. The function receives one
-            instance of this dataclass.
+        options: A dataclass whose fields are results of `argument` and `option`. The function
+            receives one instance of this dataclass.
     """
     kinds = get_type_hints(options)
     parameters = [
