@@ -192,7 +192,7 @@ def notes_on(error: BaseException) -> list[str]:
 
 
 def quick_answer(entry: Entry) -> Callable[[Any], Any] | None:
-    """Return a function that replaces a method of a component, without an import; or None.
+    """Return a function that replaces a component's method and imports no component; or None.
 
     A package may define such a function in an entry point with the name of the component. The
     function returns the same result as `accepts` of a reader with default options, or as `speed` of

@@ -63,8 +63,6 @@ def is_live(stream: TextIO) -> bool:
         return False
     try:
         return os.get_terminal_size(stream.fileno()).columns > 0
-    except (
-        OSError,
-        ValueError,
-    ):  # Assume that a terminal without a known size can overwrite lines.
+    # Assume that a terminal without a known size can overwrite lines.
+    except (OSError, ValueError):
         return True
