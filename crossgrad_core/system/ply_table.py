@@ -232,9 +232,8 @@ def _read_binary(
         found = f"{size_text(max(there, 0))} ({max(there, 0):,} bytes)"
         expected = f"{size_text(needed)} ({needed:,} bytes) for {vertex.count:,} vertices"
         raise _truncated(path, expected, found)
-    if (
-        dtype.itemsize == 0
-    ):  # Return no columns, because an element without properties contains no data.
+    # Return no columns, because an element without properties contains no data.
+    if dtype.itemsize == 0:
         return {}
     file.seek(start)
     rows = np.fromfile(file, dtype=dtype, count=vertex.count)
