@@ -406,8 +406,8 @@ def without_rounding(scene: Scene, lengths: NDArray[np.float64]) -> NDArray[np.f
 
     In regular camera layouts, equal distances differ by the rounding error of the mean camera
     centre. A threshold at the median, a rank or a logarithm would depend on this rounding error. If
-    the rounding error of the scene's input coordinates is larger, the lengths are rounded to this
-    rounding error.
+    the rounding error of the scene's input coordinates is larger than 2^-40 of the largest
+    coordinate, the lengths are rounded to this rounding error.
     """
     largest = float(np.abs(scene.centers).max(initial=0.0))
     given = float(np.abs(scene.similarity.to_input(scene.centers)).max(initial=0.0))

@@ -282,8 +282,8 @@ def overdone(rows: Sequence[Row]) -> list[str]:
     gap, step = best["psnr"] - last, best["step"]
     return [
         (
-            f"the last evaluation is {gap:.2f} dB lower than at step {step:.0f}, which "
-            f"had {best['psnr']:.2f} dB after {best['train_seconds']:,.0f} s of training: "
+            f"the last evaluation is {gap:.2f} dB lower than at step {step:.0f} "
+            f"({best['psnr']:.2f} dB after {best['train_seconds']:,.0f} s of training): "
             "a shorter run may be sufficient (--max-views N)"
         )
     ]
