@@ -109,7 +109,10 @@ class DeferredSums(Gradients):
 
     @cached_property
     def _read(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Two arrays [B, K] over blocks and views: finite gradients, and finite non-zero gradients."""
+        """Two arrays [B, K] over blocks and views.
+
+        The first is True for finite gradients, the second for finite non-zero gradients.
+        """
         magnitudes = [size for view in self._largest for size in view.values()]
         values = iter(torch.stack(magnitudes).tolist() if magnitudes else ())
         sizes = [{name: next(values) for name in view} for view in self._largest]

@@ -82,7 +82,7 @@ def _is_blank(source: PhotoSource) -> bool:
 
 
 def _counting_shares(source: PhotoSource) -> list[float]:
-    """Return the share of the stored pixels that the mask keeps, and the share that transparency keeps."""
+    """Return two shares of the stored pixels: kept by the mask, and kept by transparency."""
     shares = [1.0]
     if source.mask is not None:
         shares.append(float((decode_mask(source.mask) > 0).mean()))
@@ -180,7 +180,9 @@ def label_by_footprint(
     points: NDArray[np.float64],
     train: Sequence[int],
 ) -> tuple[str, ...]:
-    """Label views as near or far by comparing their footprints with the median over the training views.
+    """Label views as near or far by their footprints.
+
+    The threshold is the median over the training views.
 
     A view is near if its footprint is at least the median. `contract.scene.footprint` defines the
     footprint. A view without a footprint uses the footprint of the nearest camera that has a

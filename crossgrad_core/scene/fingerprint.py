@@ -87,7 +87,7 @@ class FrameMark(_Mark):
 
 
 class PointsMark(_Mark):
-    """Summary of the SfM points: number, and mean and standard deviation of positions and colours."""
+    """Summary of the SfM points: their number, and mean and deviation of positions and colours."""
 
     count: int
     moments: tuple[float, ...]

@@ -1,4 +1,4 @@
-"""The local frame: its origin is the mean of the training cameras, and its unit is the scene extent."""
+"""The local frame: the origin is the mean training camera, the unit is the scene extent."""
 
 from dataclasses import dataclass
 
@@ -42,7 +42,10 @@ class Frame:
     stray: NDArray[np.bool_]
 
     def points(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Transform points [N, 3] from the input frame to the local frame, and round them to multiples of `_GRID`."""
+        """Transform points [N, 3] from the input frame to the local frame.
+
+        Round the results to multiples of `_GRID`.
+        """
         return _snap(self.similarity.to_local(points))
 
     def pose(self, world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -64,7 +67,9 @@ def camera_centers(world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def make_frame(centers: NDArray[np.float64], points: NDArray[np.float64]) -> Frame:
-    """Choose the local frame of a scene from the centre and extent of the training cameras, as in 3DGS.
+    """Choose the local frame of a scene.
+
+    As in 3DGS, it depends on the centre and extent of the training cameras.
 
     Outlier cameras are ignored. If all training cameras are at one position, the unit is the median
     distance from the cameras to the points. Without points, it is one input unit.

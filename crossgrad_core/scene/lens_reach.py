@@ -1,4 +1,4 @@
-"""The rays that a lens model maps to unique pixels, and the image content that undistortion loses."""
+"""The rays that a lens model maps to unique pixels, and the image loss by undistortion."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -127,7 +127,7 @@ class LensCost:
 
 
 def cost_of(camera: "pycolmap.Camera", reach: LensReach, frame: Pinhole) -> LensCost:
-    """Return the image content that is lost if the photos of a camera are undistorted to `frame`."""
+    """Return the image content that is lost by undistorting a camera's photos to `frame`."""
     u = np.linspace(0.0, frame.width, _CELLS + 1)
     v = np.linspace(0.0, frame.height, _CELLS + 1)
     plane = _plane(frame, *np.meshgrid(u, v))
@@ -176,7 +176,7 @@ def _is_inside(pixels: NDArray[np.float64], camera: "pycolmap.Camera") -> NDArra
 
 
 def _last_before_fold(pixels: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the last step [A] before the model folds over, for each direction in `pixels` [A, N, 2].
+    """Return the last step [A] before the model folds over, for directions `pixels` [A, N, 2].
 
     Before the fold, the distance from the image centre grows with every step. In addition, the
     determinant of the Jacobian is positive, so that neighbouring directions keep their order.

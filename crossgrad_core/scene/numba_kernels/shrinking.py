@@ -37,7 +37,10 @@ def _add_pair(
 def _filter_columns(
     image: NDArray[np.uint8], y: int, weights: NDArray[np.float64], line: NDArray[np.float64]
 ) -> None:
-    """Filter row `y` of the image along the columns, and write it to `line` [W C], rounded to float32."""
+    """Filter row `y` of the image along the columns.
+
+    The result in `line` [W C] is rounded to float32.
+    """
     height, width = image.shape
     for left in range(0, width, _BLOCK):
         right = min(left + _BLOCK, width)
@@ -95,7 +98,10 @@ def _filter_row(
 def _columns(
     columns: int, channels: int, width: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Return the left and right neighbour [w C] of each output value, and the weight of the left neighbour."""
+    """Return the left and right neighbour [w C] of each output value.
+
+    Also return the weight of the left neighbour.
+    """
     left, right = np.empty(columns * channels, np.int64), np.empty(columns * channels, np.int64)
     near = np.empty(columns * channels)
     for column in range(columns):

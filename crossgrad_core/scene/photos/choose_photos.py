@@ -205,7 +205,7 @@ def _pair(folder: PhotoFolder, names: Sequence[str]) -> dict[str, Path]:
 def _prefer_reduced(
     full: _Found, reduced: Sequence[PhotoFolder], max_size: int | None
 ) -> tuple[_Found, list[str]]:
-    """Choose the photo folder with the largest photos within the size limit, or the full-size photos.
+    """Choose the largest photo folder within the size limit, or the full-size photos.
 
     If the photos of a reduced folder are smaller than half the limit, the full-size photos are
     used.

@@ -108,7 +108,7 @@ def _resized_by_skimage(image: Pixels, width: int, height: int) -> Pixels:
 
 
 def _gaussian(factor: float) -> NDArray[np.float64]:
-    """Return the filter weights for an image side that is divided by `factor`, from the middle outwards."""
+    """Return the filter weights, from the middle outwards, for a side that is divided by `factor`."""
     deviation = (factor - 1.0) / 2.0
     radius = int(_WIDTHS * deviation + 0.5)
     if radius == 0:
@@ -126,7 +126,7 @@ def blend(rgb: Pixels, alpha: Pixels, background: tuple[float, float, float]) ->
 
 
 def turn(pixels: Pixels, orientation: int) -> Pixels:
-    """Rotate pixels [H, W, ...] upright by an EXIF orientation that includes a quarter turn (5 to 8)."""
+    """Rotate pixels [H, W, ...] upright by an EXIF orientation with a quarter turn (5 to 8)."""
     turned = {
         5: pixels.swapaxes(0, 1),
         6: np.rot90(pixels, -1),
@@ -181,7 +181,10 @@ def _read_photo(image: "Image") -> tuple[Pixels, Pixels | None]:
 
 
 def _colours(image: "Image") -> Pixels:
-    """Decode an RGB photo [H, W, 3] in bands of rows, because np.asarray copies large photos three times."""
+    """Decode an RGB photo [H, W, 3] in bands of rows.
+
+    For large photos, np.asarray would make three copies.
+    """
     pixels = np.empty((image.height, image.width, 3), np.uint8)
     rows = max(1, _BAND // pixels[0].size)
     for top in range(0, image.height, rows):
@@ -198,7 +201,10 @@ def _read_grey(image: "Image") -> NDArray[np.int32]:
 
 
 def _read_mask(image: "Image") -> NDArray[np.int32]:
-    """Read a mask as grey [H, W], or from alpha if alpha varies and the colours are not black and white."""
+    """Read a mask [H, W] from the grey values of an image.
+
+    Use alpha instead if it varies and the colours are not black and white.
+    """
     if image.mode.startswith("I") or not pillow.has_alpha(image):
         return _read_grey(image)
     grey, alpha = (np.array(band).astype(np.int32) for band in image.convert("LA").split())

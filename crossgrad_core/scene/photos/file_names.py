@@ -193,12 +193,15 @@ def _folders(name: str) -> list[str]:
 
 
 def _base(name: str) -> str:
-    """Return the base name of a path in a normalized letter case and Unicode form."""
+    """Return the base name of a path. Letter case and Unicode form are normalized."""
     return _fold("".join(_parts(name)[-1:]))
 
 
 def _stem(name: str) -> str:
-    """Return the base name of a path without its suffix, in a normalized letter case and Unicode form."""
+    """Return the base name of a path without its suffix.
+
+    Letter case and Unicode form are normalized.
+    """
     return PurePosixPath(_base(name)).stem
 
 
