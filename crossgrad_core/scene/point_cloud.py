@@ -1,4 +1,4 @@
-"""Read point clouds from PLY, LAS or LAZ files, and reduce them to about as many points as SfM finds.
+"""Read point clouds from PLY, LAS or LAZ files, and reduce them to the density of SfM points.
 
 LAS and LAZ files, which laser scanners write, can be read if the package laspy is installed.
 
@@ -174,7 +174,7 @@ def read_las(path: Path) -> dict[str, NDArray[np.generic]]:
 
 
 def _rows(reader: "laspy.LasReader") -> Iterator[tuple[int, NDArray[np.float64]]]:
-    """Yield for each part of the file: its number of points, and the points that are kept [n, 3 or 6]."""
+    """Yield each part of the file: its number of points, and the kept points [n, 3 or 6]."""
     names, start = _names(reader), 0
     stride = -(-reader.header.point_count // _MOST_IN_LAS) or 1
     for chunk in reader.chunk_iterator(_AT_ONCE):

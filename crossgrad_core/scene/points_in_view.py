@@ -58,7 +58,9 @@ _MISTAKES: Final[tuple[tuple[str, _Change], ...]] = (
 def check_seen(
     points: PointCloud, views: Sequence[RawView], where: object, todo: str = "remove the file"
 ) -> None:
-    """Raise an error if almost no photo shows the points, because points and cameras then have different frames.
+    """Raise an error if almost no photo shows the points.
+
+    Points and cameras then have different frames.
 
     Args:
         points: The points of the input.
@@ -93,7 +95,10 @@ def check_seen(
 
 
 def _likely_cause(points: NDArray[np.float64], views: Sequence[RawView]) -> str | None:
-    """Return the mistake in the poses whose correction makes photos show the most points; None without a likely mistake."""
+    """Return the mistake in the poses whose correction makes photos show the most points.
+
+    Return None without a likely mistake.
+    """
     best, cause = _REPAIRED, None
     for text, change in _MISTAKES:
         shown = _shown_by(points, views, change)
@@ -106,7 +111,7 @@ def _likely_cause(points: NDArray[np.float64], views: Sequence[RawView]) -> str 
 def _shown_by(
     points: NDArray[np.float64], views: Sequence[RawView], change: _Change
 ) -> NDArray[np.bool_]:
-    """Return a mask [V, N]: True if a point is inside a photo after `change` is applied to the poses."""
+    """Return a mask [V, N] of the points inside each photo, after `change` modified the poses."""
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         return np.stack(
             [

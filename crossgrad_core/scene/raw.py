@@ -1,4 +1,4 @@
-"""The raw scene, which a reader returns before split and local frame are chosen, and checks of it."""
+"""The raw scene: the result of a reader before split and local frame are chosen, with checks."""
 
 import os
 import re
@@ -99,7 +99,7 @@ class CheckedPoints:
     new_row: NDArray[np.int64]
 
     def rows(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Convert row numbers of input points to sorted, distinct row numbers [S'] of finite points."""
+        """Convert rows of input points to sorted, distinct rows [S'] of finite points."""
         kept = np.unique(self.new_row[rows])
         return kept[kept >= 0]
 
@@ -157,7 +157,7 @@ def check_points(raw: RawScene) -> tuple[CheckedPoints, list[str]]:
 def check_distances(
     raw: RawScene, points: CheckedPoints, frame: Frame
 ) -> tuple[CheckedPoints, list[str]]:
-    """Remove points that are too far from the training cameras for single precision, and return a note.
+    """Remove points too far from the training cameras for single precision, and return a note.
 
     Raises:
         UserError: A camera is too far from the training cameras.

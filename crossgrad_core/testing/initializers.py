@@ -1,4 +1,4 @@
-"""Contract checks of initializers."""
+"""Contract checks for initializers."""
 
 from contextlib import suppress
 from dataclasses import fields
@@ -19,10 +19,10 @@ from crossgrad_core.testing.support.contract import (
 
 
 def adds_points(make: Make[Initializer]) -> None:
-    """Each point has a position, a colour, a size above 0 and an opacity between 0 and 1.
+    """Each added point has a position, a colour, a size above 0, and an opacity between 0 and 1.
 
-    A size or an opacity may be NaN. An initializer that can work alone is also tested on a scene
-    without points; it may raise an error there if it finds no points.
+    The size and the opacity may also be NaN. An initializer with `alone = True` is also tested on a
+    scene without points. It may raise an error there if it finds no points.
     """
     start = make()
     _require_points(start.more_points(sample_scene()))
@@ -52,7 +52,7 @@ def _require_points(more: object) -> None:
 
 
 def answers_alike(make: Make[Initializer]) -> None:
-    """Another call, even on a new object, gives the same points and the same messages."""
+    """A second call, even on a new object, returns the same points and the same messages."""
     scene = sample_scene()
     with global_randomness_untouched():
         one, other = make(), make()

@@ -108,7 +108,10 @@ def _resized_by_skimage(image: Pixels, width: int, height: int) -> Pixels:
 
 
 def _gaussian(factor: float) -> NDArray[np.float64]:
-    """Return the filter weights, from the middle outwards, for a side that is divided by `factor`."""
+    """Return the filter weights, from the middle outwards.
+
+    The filter is for a side that is divided by `factor`.
+    """
     deviation = (factor - 1.0) / 2.0
     radius = int(_WIDTHS * deviation + 0.5)
     if radius == 0:

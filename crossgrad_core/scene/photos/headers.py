@@ -1,4 +1,4 @@
-"""Read the size and kind of photos from their headers without decoding, and detect truncated files."""
+"""Read the size and kind of photos from their headers, and detect truncated files."""
 
 from dataclasses import dataclass, replace
 from math import inf

@@ -214,7 +214,7 @@ def _undecorated(name: str) -> str:
 
 
 def with_photo_names(raw: RawScene) -> RawScene:
-    """Return the scene with the name of each posed image replaced by its photo's path below `images`.
+    """Return the scene with each image named by the path of its photo below `images`.
 
     Programs may write absolute paths, or paths relative to another folder. If a name differs from
     the photo only in suffix or letter case, the name is unchanged.

@@ -1,4 +1,4 @@
-"""Write notes about the files of a scene: how its photos are processed, and which files are unused."""
+"""Write notes on the photos of a scene and how they are processed, and on unused files."""
 
 import os
 from collections import Counter, defaultdict
@@ -33,7 +33,10 @@ _MOST: Final = 8
 def note_pairing(
     folder: PhotoFolder, paths: Mapping[str, Path], names: Sequence[str], used: Collection[Path]
 ) -> list[str]:
-    """Note posed images without a photo, photos without a pose, and photos whose names differ in suffix or letter case."""
+    """Note posed images without a photo and photos without a pose.
+
+    Also note photos whose names differ in suffix or letter case.
+    """
     absent = [name for name in names if name not in paths]
     used_paths = frozenset(used)
     others = [name for name in folder.names if folder.path / name not in used_paths]

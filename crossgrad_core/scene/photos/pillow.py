@@ -1,4 +1,4 @@
-"""Open photo files with Pillow: allowed formats, a pixel limit, and a common error type for all defects.
+"""Open photo files with Pillow: allowed formats, a pixel limit, and one error type.
 
 HEIC and HEIF files, which phones write, can be read if the package pillow-heif is installed.
 """
@@ -112,8 +112,8 @@ def is_deep(image: "Image") -> bool:
 def take_lower_bytes(image: "Image") -> None:
     """Make Pillow decode the lower byte of each 16-bit colour value instead of the upper byte.
 
-    Pillow has no 16-bit colour modes and decodes only one byte of each value. If Pillow is told the
-    opposite byte order, it decodes the other byte.
+    Pillow has no 16-bit colour modes and decodes only one byte of each value. If `tile` names the
+    opposite byte order, Pillow decodes the other byte.
     """
     other = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L"}
     modes = [mode[:-1] + other[mode[-1]] for mode in _stored_modes(image)]
@@ -146,7 +146,7 @@ def _check_pixels(image: "Image", path: Path) -> None:
 
 
 def _identified(file: BinaryIO, path: Path) -> "Image":
-    """Open an image without Pillow's own pixel limit. crossgrad checks the number of pixels later."""
+    """Open an image without Pillow's own pixel limit. crossgrad checks its own limit later."""
     from PIL import Image
 
     Image.init()
