@@ -187,7 +187,7 @@ def _weighted(gaussians: Gaussians) -> Tensor:
 
 
 def checkpoints_give_the_same_gaussians(make: Make[Backbone]) -> None:
-    """Parameters that were saved and loaded decode to bit-identical Gaussians, without random numbers."""
+    """Parameters that were saved and loaded decode to bit-identical Gaussians."""
     backbone = make()
     parameters = created(backbone)
     written = save({name: tensor.detach().contiguous() for name, tensor in parameters.items()})
@@ -247,7 +247,7 @@ def _require_equal(parameters: Mapping[str, Tensor], copies: Mapping[str, Tensor
 
 
 def baking_gives_plain_gaussians(make: Make[Backbone]) -> None:
-    """Baking for a PLY file returns Gaussians with spherical harmonics and without an autograd graph."""
+    """Baked Gaussians for a PLY file have spherical harmonics and no autograd graph."""
     backbone = make()
     baked = backbone.bake(created(backbone), sample_phase(training=False), [sample_camera()])
     require(baked.sh_dc is not None and baked.colors is None, "bake() does not return sh_dc")
@@ -258,7 +258,7 @@ def baking_gives_plain_gaussians(make: Make[Backbone]) -> None:
 
 
 def plain_ones_bake_what_they_draw(make: Make[Backbone]) -> None:
-    """If `plain` is True, baked Gaussians give the same image as decoded Gaussians for every camera."""
+    """With `plain`, baked and decoded Gaussians give the same image for every camera."""
     backbone = make()
     if not backbone.plain:
         raise cannot_tell("the backbone does not declare that a standard PLY loses nothing (plain)")
@@ -302,7 +302,10 @@ def _grown(parameters: Parameters) -> Parameters:
 
 
 def fitting_respects_the_user(make: Make[Backbone]) -> None:
-    """`fitted_to` returns a note for each change of options, and never changes an option that the user set."""
+    """`fitted_to` returns a note for each changed option.
+
+    It never changes an option that the user set.
+    """
     backbone = make()
     fitted, notes = backbone.fitted_to(sample_scene())
     explained = fitted == backbone or len(notes) > 0
@@ -314,7 +317,10 @@ def fitting_respects_the_user(make: Make[Backbone]) -> None:
 
 
 def passed_on_tensors_are_handed_over(make: Make[Backbone]) -> None:
-    """A tensor in `passthrough` becomes part of the Gaussians unchanged, and `decode` does not read its values."""
+    """A tensor in `passthrough` becomes part of the Gaussians unchanged.
+
+    `decode` does not read its values.
+    """
     backbone = make()
     parameters = created(backbone)
     for name in parameters.keys() & set(backbone.passthrough.values()):

@@ -271,7 +271,7 @@ def never_outgrows_the_room(make: Make[Densifier]) -> None:
 
 
 def most_primitives_survive(make: Make[Densifier]) -> None:
-    """No edit removes nearly all primitives of a good model, because training could not restore them."""
+    """No edit removes nearly all primitives of a good model. Training could not restore them."""
     run = DensifierRun.of(make())
     for step in range(_EDIT - 4, _EDIT + 1):
         before = run.primitives

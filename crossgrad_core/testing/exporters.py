@@ -85,7 +85,7 @@ def writes_the_input_frame(make: Make[Exporter]) -> None:
 
 
 def what_it_writes_is_read_again(make: Make[Exporter]) -> None:
-    """`read` returns the positions, sizes and opacities of the result of `stored`, up to float32 rounding."""
+    """`read` returns the result of `stored`: positions, sizes and opacities, up to float32 rounding."""
     exporter = make()
     if type(exporter).read is Exporter.read:
         raise cannot_tell("crossgrad writes files of this format but does not read them")
@@ -110,7 +110,7 @@ def what_it_writes_is_read_again(make: Make[Exporter]) -> None:
 
 
 def the_stored_ones_can_be_drawn(make: Make[Exporter]) -> None:
-    """`stored` returns as many Gaussians as it received, all finite, and does not change its input."""
+    """`stored` returns as many finite Gaussians as it received, and does not change its input."""
     given = _gaussians()
     stored = make().stored(given)
     require(isinstance(stored, Gaussians), f"stored() returns {stored!r}, not Gaussians")

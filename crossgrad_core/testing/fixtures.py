@@ -147,7 +147,10 @@ def posed_view(
     focal: float = 4.0,
     seen: Sequence[int] = (),
 ) -> View:
-    """Create a 4 x 4 view at `center` [3] that looks along `forward` [3], with its top towards `up` [3]."""
+    """Create a 4 x 4 view at `center` [3].
+
+    It looks along `forward` [3], and its top is towards `up` [3].
+    """
     z = _unit(np.asarray(forward, dtype=np.float64))
     x = _unit(np.cross(z, np.asarray(up, dtype=np.float64)))
     rotation = np.stack([x, np.cross(z, x), z])

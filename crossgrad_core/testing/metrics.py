@@ -40,7 +40,10 @@ def its_columns_are_its_own(make: Make[Metric]) -> None:
 
 
 def measures_a_finite_number(make: Make[Metric]) -> None:
-    """For every view, the result is a finite number or None, even if the render equals the photo."""
+    """For every view, the result is a finite number or None.
+
+    This also holds if the render equals the photo.
+    """
     photo = sample_scene().test_views[0].photo.image()
     for render in (_render(), photo, torch.zeros_like(photo)):
         _require_number(make().measure(_compared(render)))

@@ -101,7 +101,7 @@ _KEPT, _BLOCK = 100_000, 4
 
 
 class _Components:
-    """Replacements for the selected components: fixed views, full-size images, plain sum, no edit."""
+    """Replacements for the selected components: fixed views, full size, plain sum, no edit."""
 
     @hookimpl
     def crossgrad_sample_views(self, context: SampleContext) -> SampleResult:
@@ -227,7 +227,10 @@ def survives_an_early_end(make: Make[Observer]) -> None:
 
 
 def hooks_stay_answered(make: Make[Observer]) -> None:
-    """If the observer wraps a hook, the hook still returns a finite result of the right type and shape."""
+    """If the observer wraps a hook, the hook still returns a valid result.
+
+    The result is finite and has the right type and shape.
+    """
     run, observer = DensifierRun.of(build(Densifier, NO_DENSIFIER, {})), make()
     with _hooks(observer) as hooks:
         _start(hooks, None)
@@ -264,7 +267,7 @@ def _require_gradients(step: int, aggregated: AggregateResult) -> None:
 
 
 def questions_are_answered_in_kind(make: Make[Observer]) -> None:
-    """Results of the observer's own hooks are valid, and parameters change only through returned edits."""
+    """The observer's hooks return valid results. Parameters change only through returned edits."""
     config = RunConfig(scene="sample", device="cpu")
     config, *_ = with_decisions(config, sample_scene())
     selection, _ = select(config, sample_scene(), reader="sample")

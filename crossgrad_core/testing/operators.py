@@ -81,7 +81,7 @@ def operator_case(views: int, step: int = 1, scale: float = 1.0) -> OperatorCase
 
 
 def _families(draw: Array) -> Iterator[tuple[str, Array]]:
-    """Yield the names and gradients [K, _SIZE] of all families, made from one normally distributed sample."""
+    """Yield the names and gradients [K, _SIZE] of all families, made from a normal random sample."""
     views = len(draw)
     ramp = np.arange(views)[:, None]
     yield "usual", draw
@@ -260,7 +260,7 @@ def scales_with_the_gradients(make: Make[Operator]) -> None:
 
 
 def views_that_are_alike_count_alike(make: Make[Operator]) -> None:
-    """The order of the views in a step has no effect: views with equal properties get equal weights.
+    """The order of the views has no effect: views with equal properties get equal weights.
 
     The tested gradients all have the same length and the same angle to each other. With more than
     two views, only right angles are tested. For conflicting gradients, an operator may process

@@ -46,7 +46,7 @@ def _shape(name: str, tensor: Tensor | None, *expected: int) -> None:
 
 
 def renders_have_the_shape(make: Make[Rasterizer]) -> None:
-    """Image [H, W, 3], alpha [H, W], radii [N] int32 and all optional outputs have the right shapes."""
+    """Image [H, W, 3], alpha [H, W], radii [N] int32 and optional outputs have the right shapes."""
     rasterizer = make()
     gaussians = moved(sample_gaussians(), device_of(rasterizer))
     render = _drawn(rasterizer, gaussians)
@@ -73,7 +73,7 @@ def the_background_shows_through(make: Make[Rasterizer]) -> None:
 
 
 def nothing_to_draw_is_no_error(make: Make[Rasterizer]) -> None:
-    """If no Gaussian is in front of the camera, the image shows the background and all radii are 0."""
+    """If no Gaussian is in front of the camera, the image is the background and all radii are 0."""
     rasterizer = make()
     device = device_of(rasterizer)
     sample = moved(sample_gaussians(), device)

@@ -92,7 +92,7 @@ def _require_good(draw: ViewSample, counts: frozenset[int], available: int) -> N
 
 
 def draws_hand_on_the_groups(make: Make[Sampler]) -> None:
-    """If the training views have groups, every sample contains labels, because operators may need them."""
+    """If the training views have groups, every sample contains labels. Operators may need them."""
     sampler = make()
     if sampler.default_grouping is not None or sampler.own_labels:
         raise cannot_tell("it chooses its own groups")

@@ -376,7 +376,7 @@ class _Group:
         return max(_FITS * self.better, LEAST)
 
     def _fitting_others(self, rows: Integers, candidates: Integers) -> Integers:
-        """Return the rows of cameras that better fit the photo of another camera in `candidates`."""
+        """Return the rows of cameras that fit the photo of another camera in `candidates`."""
         others = self.views[candidates]
         fitting = []
         for row in rows:

@@ -165,7 +165,7 @@ def _require_same(what: str, one: Tensor | None, other: Tensor | None) -> None:
 
 
 def gradients_stay_untouched(make: Make[Operator]) -> None:
-    """The operator does not change the gradients of the views, because other plugins read them later."""
+    """The operator does not change the gradients of the views. Other plugins read them later."""
     operator = make()
     for views in admitted(operator.views):
         gradients, copies = sample_gradients(views), sample_gradients(views)
@@ -178,7 +178,10 @@ def gradients_stay_untouched(make: Make[Operator]) -> None:
 
 
 def same_seed_same_aggregation(make: Make[Operator]) -> None:
-    """Two calls with the same seed return the same bits, and the returned states survive a checkpoint."""
+    """Two calls with the same seed return the same bits.
+
+    The returned states survive a checkpoint.
+    """
     for views in admitted(make().views):
         with global_randomness_untouched():
             one = aggregated(make(), sample_gradients(views))

@@ -50,7 +50,7 @@ def require(holds: object, otherwise: str) -> None:
 
 
 def cannot_tell(reason: str) -> SkipTest:
-    """Return the exception for a check that does not apply. pytest then reports the check as skipped."""
+    """Return the exception for a check that does not apply. pytest reports such a check as skipped."""
     return SkipTest(reason)
 
 
@@ -68,7 +68,9 @@ def admitted(views: ViewCounts) -> tuple[int, ...]:
 
 
 def revived(state: PluginState) -> PluginState:
-    """Return the state as it would be after a checkpoint: values are converted to JSON and back, and tensors are copied.
+    """Return the state as it would be after a checkpoint.
+
+    Values are converted to JSON and back, and tensors are copied.
 
     Raises:
         ContractError: The values cannot be stored as JSON.

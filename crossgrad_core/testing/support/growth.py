@@ -87,7 +87,7 @@ def time_hooks(manager: pluggy.PluginManager, seconds: dict[str, float]) -> None
 
 @contextmanager
 def traced_memory() -> Iterator[Callable[[], int]]:
-    """Yield a function that returns the bytes that Python, NumPy and torch tensors have allocated."""
+    """Yield a function that returns the bytes allocated by Python, NumPy and torch tensors."""
     traced = tracemalloc.is_tracing()
     if not traced:
         tracemalloc.start()
@@ -99,7 +99,7 @@ def traced_memory() -> Iterator[Callable[[], int]]:
 
 
 def _tensors() -> int:
-    """Return the bytes of all existing tensors, because tracemalloc does not record torch's allocations."""
+    """Return the bytes of all existing tensors. tracemalloc does not record torch's allocations."""
     gc.collect()
     storages = {}
     for candidate in gc.get_objects():

@@ -255,7 +255,7 @@ def the_camera_is_heeded(make: Make[Rasterizer]) -> None:
 
 
 def extreme_gaussians_are_drawn_alike(make: Make[Rasterizer]) -> None:
-    """Opaque, transparent, thin, very large and very small Gaussians are rendered as by the reference."""
+    """Opaque, transparent, thin, very large and very small Gaussians match the reference."""
     _require_all(make(), _extremes)
 
 

@@ -73,7 +73,7 @@ def parameters_in_a_run(parameters: Mapping[str, Tensor]) -> Mapping[str, Tensor
 
 
 def gaussians_in_a_run(gaussians: Gaussians, backbone: Backbone) -> Gaussians:
-    """Return the Gaussians with on-demand rows for the tensors that the backbone passes through, as in a run.
+    """Return the Gaussians as in a run, with on-demand rows for tensors that the backbone passes through.
 
     Here, all rows are up to date, so that a request for rows does nothing.
     """

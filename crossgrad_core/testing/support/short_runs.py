@@ -89,7 +89,7 @@ def _copied(parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def require_sound(run: ShortRun) -> None:
-    """Require that all losses and parameters are finite, and that the first step changes a parameter."""
+    """Require finite losses and parameters. The first step must change a parameter."""
     for step, record in enumerate(run.records, 1):
         good = all(0.0 <= loss < _LARGEST_LOSS for loss in record.losses)
         require(good, f"step {step}: the losses are {record.losses}; expected 0 to 10")
