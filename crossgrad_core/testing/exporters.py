@@ -85,7 +85,10 @@ def writes_the_input_frame(make: Make[Exporter]) -> None:
 
 
 def what_it_writes_is_read_again(make: Make[Exporter]) -> None:
-    """`read` returns the result of `stored`: positions, sizes and opacities, up to float32 rounding."""
+    """`read` returns positions, sizes and opacities of the result of `stored`.
+
+    They may differ by float32 rounding.
+    """
     exporter = make()
     if type(exporter).read is Exporter.read:
         raise cannot_tell("crossgrad writes files of this format but does not read them")

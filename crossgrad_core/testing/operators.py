@@ -81,7 +81,7 @@ def operator_case(views: int, step: int = 1, scale: float = 1.0) -> OperatorCase
 
 
 def _families(draw: Array) -> Iterator[tuple[str, Array]]:
-    """Yield the names and gradients [K, _SIZE] of all families, made from a normal random sample."""
+    """Yield the names and gradients [K, _SIZE] of all families, made from a random sample."""
     views = len(draw)
     ramp = np.arange(views)[:, None]
     yield "usual", draw

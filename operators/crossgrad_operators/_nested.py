@@ -1,4 +1,7 @@
-"""Operators that contain other operators: they are built from names or options, and their states are nested."""
+"""Operators that contain other operators.
+
+They are built from names or options, and their states are nested.
+"""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace

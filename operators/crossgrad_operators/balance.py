@@ -33,7 +33,7 @@ class Aligned(Weighting):
 
 
 class IMTLG(Weighting):
-    """The combination whose projections on all unit gradients are equal, with weights that add up to 1.
+    """The combination with equal projections on all unit gradients, and with weights of sum 1.
 
     The equations are G v = (|g_k|) with the Gramian G, and w = v / sum v. For two views, w =
     (|g_2|, |g_1|) / (|g_1| + |g_2|), and the result is the bisector. If G is singular, v is the

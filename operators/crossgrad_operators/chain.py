@@ -107,7 +107,7 @@ class Chain(GramianOperator):
 def _noise(
     seen: NDArray[np.float64], product: NDArray[np.float64], gramians: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Return True for rows [B, R] of M G that are zero, or only rounding noise of cancelling terms."""
+    """Return True for rows [B, R] of M G that are zero or only cancellation noise."""
     norms = np.sqrt(np.diagonal(gramians, axis1=1, axis2=2))
     terms = np.abs(product) @ norms[:, :, None]
     empty: NDArray[np.bool_] = np.diagonal(seen, axis1=1, axis2=2) <= _NOISE * terms[:, :, 0] ** 2

@@ -13,7 +13,9 @@ from crossgrad_operators._weights import Flags, Floats, extended_precision
 
 
 class MGDA(Weighting):
-    """The shortest convex combination of the gradients: w >= 0 with sum w = 1 minimizes |sum w_k g_k|.
+    """The shortest convex combination of the gradients.
+
+    Weights w >= 0 with sum w = 1 minimize |sum w_k g_k|.
 
     For two views, a closed form is used. For more views, the active-set method of Lawson and Hanson
     is used. For float64 gradients, weights are computed with 32 digits. The result is at most as
@@ -35,7 +37,9 @@ class MGDA(Weighting):
 
 
 class CAGrad(Weighting):
-    """The direction near the mean gradient that maximizes the smallest decrease of the loss over all views.
+    """The direction near the mean gradient that best decreases every loss.
+
+    It maximizes the smallest decrease over all views.
 
     With the mean g_0, d maximizes min_k g_k.d subject to |d - g_0| <= c |g_0|. The solution is d =
     g_0 + (c |g_0| / |g_w|) g_w. Here g_w is the convex combination that minimizes g_w.g_0 + c |g_0|

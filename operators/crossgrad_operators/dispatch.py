@@ -153,7 +153,10 @@ class Dispatch(GramianOperator):
 
     @hookimpl
     def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
-        """Return the objections of all operators, and objections to rules for blocks that do not exist."""
+        """Return the objections of all operators.
+
+        Also return objections to rules for blocks that do not exist.
+        """
         reasons = [
             reason
             for operator in self._operators().values()

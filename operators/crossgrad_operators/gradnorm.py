@@ -111,7 +111,7 @@ def _fresh(loss: float) -> dict[str, Any]:
 
 
 def _at(group: dict[str, Any], level: int, loss: float) -> dict[str, Any]:
-    """Return the stored losses of a group at an octave, and record this octave as the newest octave.
+    """Return the stored losses of a group at an octave. Record this octave as the newest octave.
 
     Losses at full size are stored directly in the entry of the group.
     """

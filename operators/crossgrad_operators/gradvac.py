@@ -14,7 +14,9 @@ from crossgrad_operators.projection import random_order
 
 
 class GradVac(GramianOperator):
-    """The sum of the gradients after each gradient was rotated towards the other gradients, up to the average cosine of the pair.
+    """The sum of rotated gradients.
+
+    Each gradient is rotated towards the other gradients, up to the average cosine of the pair.
 
     For each view i, v starts as g_i. For all j != i in random order, phi = cos(v, g_j). If phi is
     below the target t_ij, a multiple of g_j is added to v, so that the cosine becomes t_ij. Then

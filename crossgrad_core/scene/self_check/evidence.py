@@ -167,7 +167,7 @@ class Agreement:
 
     @property
     def noise(self) -> Floats:
-        """[V] standard deviation of the points' colours from the colours that the photo predicts"""
+        """[V] standard deviation of the points' colours from the colours predicted by the photo."""
         return self.spread * np.sqrt(np.maximum(1.0 - np.maximum(self.correlation, 0.0) ** 2, 0.0))
 
 

@@ -62,7 +62,7 @@ def options_can_be_set(make: Make[Component]) -> None:
 
 
 def hooks_exist(make: Make[Component]) -> None:
-    """Every hook of the component exists, is marked with `hookimpl`, and takes the right arguments."""
+    """Each hook of the component exists, is marked with `hookimpl`, and has valid arguments."""
     try:
         make_manager({"component": make()})
     except UserError as error:

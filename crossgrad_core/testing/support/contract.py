@@ -50,7 +50,7 @@ def require(holds: object, otherwise: str) -> None:
 
 
 def cannot_tell(reason: str) -> SkipTest:
-    """Return the exception for a check that does not apply. pytest reports such a check as skipped."""
+    """Return the exception for a check that does not apply. pytest then reports a skipped check."""
     return SkipTest(reason)
 
 

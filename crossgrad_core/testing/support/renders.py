@@ -73,7 +73,9 @@ def parameters_in_a_run(parameters: Mapping[str, Tensor]) -> Mapping[str, Tensor
 
 
 def gaussians_in_a_run(gaussians: Gaussians, backbone: Backbone) -> Gaussians:
-    """Return the Gaussians as in a run, with on-demand rows for tensors that the backbone passes through.
+    """Return the Gaussians as in a run.
+
+    Tensors that the backbone passes through have on-demand rows.
 
     Here, all rows are up to date, so that a request for rows does nothing.
     """

@@ -1,4 +1,4 @@
-"""Kernels for equal projections and bargaining (IMTL-G, Nash-MTL) and equal singular values (Aligned-MTL).
+"""Kernels for equal projections (IMTL-G), bargaining (Nash-MTL) and equal singular values (Aligned-MTL).
 
 Each kernel can compute with 16 or with 32 digits. Each kernel marks the blocks for which rounding
 of the Gramian may affect a result with 16 digits.
@@ -107,7 +107,9 @@ def _add_solution(
     v: Pairs,
     exact: Exact,
 ) -> None:
-    """Add x_i (x_i.r) / l_i to `v` for the chosen eigenvectors x_i with eigenvalues l_i. r is the right-hand side.
+    """Add x_i (x_i.r) / l_i to `v` for the chosen eigenvectors x_i.
+
+    The l_i are the eigenvalues, and r is the right-hand side.
 
     An eigenvector is skipped if the terms of x_i.r cancel up to the share `least`. The eigenvector
     is then orthogonal to r, except for rounding noise.
@@ -314,7 +316,10 @@ def _bargained(cosines: Pairs, beta: Floats, exact: Exact) -> bool:
 
 @strict_kernel
 def geometric_mean(values: Floats) -> float:
-    """Return the n-th root of a product of n numbers, without overflow, underflow or loss of digits."""
+    """Return the n-th root of a product of n numbers.
+
+    Overflow, underflow and loss of digits are avoided.
+    """
     mantissa, exponent = 1.0, 0
     for value in values:
         fraction, power = math.frexp(value)

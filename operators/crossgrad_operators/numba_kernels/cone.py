@@ -61,13 +61,16 @@ def _projected(problem: Polyhedron, z: Pairs) -> None:
 
 @strict_device
 def _weight(z: Pair, norm: Pair, other: Pair, exact: Exact) -> float:
-    """Return the weight of a gradient, from the coefficient z of its unit vector in units of `norm`."""
+    """Return the weight of a gradient, from the coefficient z of its unit vector.
+
+    The unit of z is `norm`.
+    """
     return product(z, quotient(norm, other, exact), exact)[0]
 
 
 @strict_kernel
 def upgrad(gramians: Floats, rounding_residuals: Floats, present: Flags, exact: Exact) -> Solved:
-    """Return rows [B, K, K]: each gradient divided by K, after projection onto the conflict-free cone."""
+    """Return rows [B, K, K]: each gradient / K, projected onto the conflict-free cone."""
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views, views)), np.zeros(blocks, np.bool_)
     problem = polyhedron(views, exact)
@@ -90,7 +93,7 @@ def upgrad(gramians: Floats, rounding_residuals: Floats, present: Flags, exact: 
 
 @strict_kernel
 def dualproj(gramians: Floats, rounding_residuals: Floats, present: Flags, exact: Exact) -> Solved:
-    """Return weights [B, K]: the mean gradient after projection onto the conflict-free cone."""
+    """Return weights [B, K] of the mean gradient, projected onto the conflict-free cone."""
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
     problem = polyhedron(views, exact)

@@ -103,7 +103,9 @@ def present_in(problem: Polyhedron) -> int:
 
 @strict_device
 def what_is_left(problem: Polyhedron, x: Pairs) -> float:
-    """Return a factor for the coefficients x: 0 if only rounding noise of opposite directions remains.
+    """Return a factor for the coefficients x.
+
+    It is 0 if only rounding noise of opposite directions remains.
 
     Two directions are opposite if 1 + cos is at most 1e-12. `share_left` contains the rule for more
     than two directions.

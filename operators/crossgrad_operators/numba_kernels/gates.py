@@ -20,7 +20,9 @@ MET = 1e-9
 def confident(
     moments: Floats, gramians: Floats, present: Flags, beta: float, score: float, warmup: int
 ) -> Flags:
-    """Return True for pairs [B, K, K] that have probably conflicted for some time, and update `moments`.
+    """Return True for pairs [B, K, K] that have probably conflicted for some time.
+
+    Update `moments`.
 
     Args:
         moments: [B, 3, K, K] exponential averages of the cosine and of its square, without bias
@@ -76,7 +78,10 @@ def _scale(logs: Floats, active: Flags) -> None:
 
 @strict_device
 def _group_lengths(gramian: Floats, group: Indices, lengths: Floats) -> None:
-    """Write the length of each group's summed gradient to `lengths` [S], or 0 if it is only rounding noise."""
+    """Write the length of each group's summed gradient to `lengths` [S].
+
+    Write 0 if it is only rounding noise.
+    """
     views = group.size
     longest = np.zeros(lengths.size)
     lengths[:] = 0.0

@@ -1,4 +1,4 @@
-"""Linear algebra for small matrices, also for matrices with diagonal elements of very different size."""
+"""Linear algebra for small matrices, accurate also for diagonal elements of very different size."""
 
 import numpy as np
 
@@ -136,7 +136,7 @@ def smallest_pivot(cosines: Floats, count: int) -> float:
 
 @strict_device
 def _rotation(one: Pair, other: Pair, between: Pair, exact: Exact) -> tuple[Pair, Pair, Pair]:
-    """Return the tangent, cosine and sine of the rotation that sets an off-diagonal element to zero."""
+    """Return tangent, cosine and sine of the rotation that clears an off-diagonal element."""
     theta = quotient(minus(other, one, exact), product((2.0, 0.0), between, exact), exact)
     # Above this limit, theta^2 overflows, or adding 1 to theta^2 has no effect.
     far = 1e150 if exact is None else 1e17
@@ -164,7 +164,10 @@ def _turn(row: Pairs, p: int, q: int, cosine: Pair, sine: Pair, exact: Exact) ->
 
 @strict_part
 def _rotate(matrix: Pairs, vectors: Pairs, p: int, q: int, exact: Exact) -> None:
-    """Apply a Jacobi rotation that sets the element (p, q) of a matrix to zero, and update the eigenvectors."""
+    """Apply a Jacobi rotation that sets the element (p, q) of a matrix to zero.
+
+    Update the eigenvectors.
+    """
     between = at(matrix[p], q)
     one, other = at(matrix[p], p), at(matrix[q], q)
     t, cosine, sine = _rotation(one, other, between, exact)

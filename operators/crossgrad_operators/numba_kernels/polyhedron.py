@@ -1,4 +1,6 @@
-"""Find the point of a polyhedron {x: x.e_k >= h_k} nearest to a given point, from the cosines of the e_k.
+"""Find the point of a polyhedron {x: x.e_k >= h_k} nearest to a given point.
+
+Only the cosines of the e_k are needed.
 
 For the given point sum b_k e_k, the nearest point is sum (b_k + y_k) e_k with y >= 0. A multiplier
 y_k is positive only if x.e_k = h_k. MGDA, CAGrad, UPGrad and DualProj all need such a point. If the
@@ -157,7 +159,7 @@ def _slope(problem: Polyhedron) -> float:
 
 @strict_part
 def _factorise(problem: Polyhedron) -> int:
-    """List the active constraints, factorize their matrix, and return how many constraints are active."""
+    """List the active constraints, factorize their matrix, and return their number."""
     exact, ridge = problem.rounding.exact, problem.rounding.ridge
     factor, chosen = problem.factor, problem.chosen
     count = 0
@@ -196,9 +198,9 @@ def substitute(problem: Polyhedron, count: int, right: Pairs, out: Pairs) -> Non
 
 @strict_device
 def _first_zero(problem: Polyhedron, count: int) -> tuple[float, int]:
-    """Return the share of the step after which a multiplier becomes zero, and the number of its constraint.
+    """Return the share of the step after which a multiplier becomes zero.
 
-    Without such a multiplier, return (1, -1).
+    Also return the number of its constraint. Without such a multiplier, return (1, -1).
     """
     share, leaving = 1.0, -1
     for i in range(count):
@@ -285,7 +287,9 @@ def approach(problem: Polyhedron) -> int:
 
 @strict_device
 def is_settled(problem: Polyhedron) -> bool:
-    """Return True if the ridge has no visible effect, because the active directions are not nearly dependent.
+    """Return True if the ridge has no visible effect.
+
+    The active directions are then not nearly dependent.
 
     The function also sets `ill_conditioned` if the directions require more digits.
     """

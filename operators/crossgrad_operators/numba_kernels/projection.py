@@ -1,4 +1,6 @@
-"""Kernels for pairwise projection: each gradient is changed by its conflicts with the other gradients, in turn.
+"""Kernels for pairwise projection.
+
+Each gradient is changed by its conflicts with the other gradients, in turn.
 
 A vector v is stored as a sum of unit gradients. The coefficients of this sum have 16 or 32 digits.
 """

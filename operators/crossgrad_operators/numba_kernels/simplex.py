@@ -70,7 +70,10 @@ PIVOT = 1e-15
 
 @strict_device
 def _reciprocals(norms: Pairs, present: Flags, r: Pairs, exact: Exact) -> None:
-    """Write r_k = s / |g_k| to `r`, with s the smallest norm, and zeros for views without a gradient."""
+    """Write r_k = s / |g_k| to `r`, where s is the smallest norm.
+
+    Views without a gradient get zeros.
+    """
     shortest = -1
     for k in range(present.size):
         if present[k] and (shortest < 0 or norms[k, 0] < norms[shortest, 0]):
@@ -205,7 +208,10 @@ def _change(problem: Polyhedron, count: int, search: Search, level: Pair, ridge:
 
 @strict_device
 def _is_beyond_reach(problem: Polyhedron, search: Search) -> bool:
-    """Return True if only the ridge keeps the multipliers bounded, so that their sum is rounding noise."""
+    """Return True if only the ridge keeps the multipliers bounded.
+
+    Their sum is then rounding noise.
+    """
     total = 0.0
     for k in range(len(search.r)):
         moved = problem.y[k, 0] - problem.centre[k, 0]
@@ -228,7 +234,9 @@ def _repeats(problem: Polyhedron, before: Flags) -> bool:
 
 @strict_section
 def _find_level(problem: Polyhedron, search: Search, level: Pair, ridge: float) -> Pair:
-    """Return the level at which the nearest point has the distance rho, and compute its multipliers.
+    """Return the level at which the nearest point has the distance rho.
+
+    Also compute its multipliers.
 
     The distance is a convex and increasing function of the level. The function is solved piece by
     piece; on each piece, the active constraints are the same. If a solution is outside the interval
@@ -303,9 +311,9 @@ def _defined(problem: Polyhedron, search: Search) -> float:
 
 @strict_device
 def _cagrad_pair(n1: float, n2: float, cosine: float, c: float) -> tuple[float, float, float]:
-    """Return three numbers for two gradients with norms 1 = n1 >= n2: the weight of g_1 in g_w, |g_w|, and |g_0|.
+    """Return three numbers for two gradients with norms 1 = n1 >= n2.
 
-    Here g_0 is the mean gradient.
+    They are the weight of g_1 in g_w, |g_w|, and |g_0|. Here g_0 is the mean gradient.
 
     The objective (a - b) x / 2 + c |g_0| sqrt(D (x - x_0)^2 + h^2) is convex in the weight x of
     g_1. The other symbols are constants. Sums of squares are arranged such that only the cosine
@@ -424,7 +432,7 @@ def _cagrad(problem: Polyhedron, norms: Pairs, q: Pairs, c: float, result: Float
 def cagrad(
     gramians: Floats, rounding_residuals: Floats, present: Flags, exact: Exact, c: float
 ) -> Solved:
-    """Return the weights [B, K] 1/K + c |g_0| w_k / |g_w| of CAGrad's direction, without rescaling."""
+    """Return weights [B, K] of CAGrad's direction, 1/K + c |g_0| w_k / |g_w|, without rescaling."""
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
     problem = polyhedron(views, exact)
