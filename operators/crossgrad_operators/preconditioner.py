@@ -1,4 +1,4 @@
-"""Scale gradients by camera distance, without changing directions (arXiv 2605.00052, equation preconditioner)."""
+"""Scale gradients by camera distance (arXiv 2605.00052, equation preconditioner)."""
 
 import numpy as np
 from numpy.typing import NDArray

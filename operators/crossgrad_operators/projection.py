@@ -1,4 +1,4 @@
-"""Operators that project pairs of gradients: a gradient loses components that conflict with other gradients."""
+"""Operators that project pairs of gradients, so that a gradient loses conflicting components."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -16,7 +16,9 @@ NARROW = 1e-12
 
 
 class Symmetric(GramianOperator):
-    """A sum of projected gradients: in a conflicting pair, each gradient loses its component along the other.
+    """A sum of projected gradients.
+
+    In a conflicting pair, each gradient loses its component along the other gradient.
 
     For m = g_1.g_2 < 0, g_1' = g_1 - (m / |g_2|^2) g_2 and g_2' = g_2 - (m / |g_1|^2) g_1. These
     are the equations proj_near, proj_far and final_update of the paper, which equal PCGrad for two
@@ -131,7 +133,7 @@ def project(
     threshold: float = 0.0,
     strength: float = 1.0,
 ) -> NDArray[np.float64]:
-    """Return the matrices [B, K, K] that project each gradient against the gradients with which it conflicts.
+    """Return the matrices [B, K, K] that project each gradient against its conflicts.
 
     Args:
         gramians: [B, K, K] Gramians.

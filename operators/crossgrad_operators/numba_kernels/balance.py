@@ -1,4 +1,4 @@
-"""Kernels for equal projections (IMTL-G), bargaining (Nash-MTL) and equal singular values (Aligned-MTL).
+"""Kernels for equal projections (IMTL-G), bargaining (Nash-MTL), equal singular values (Aligned).
 
 Each kernel can compute with 16 or with 32 digits. Each kernel marks the blocks for which rounding
 of the Gramian may affect a result with 16 digits.

@@ -18,7 +18,9 @@ EXACT = 10_000
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """K gradients with P = H + R * Q elements: a head of H elements, then R copies of a pattern of Q elements.
+    """K gradients with P = H + R * Q elements.
+
+    A head of H elements is followed by R copies of a pattern of Q elements.
 
     Gramians are sums over elements. They can therefore be computed exactly for any P.
 
@@ -50,12 +52,18 @@ class Case:
 
     @cached_property
     def exact_head(self) -> Rows:
-        """[K, H] values of the head as the operator receives them: rounded, and zero for absent views."""
+        """[K, H] values of the head that the operator receives.
+
+        They are rounded, and zero for absent views.
+        """
         return self._rounded(self.head)
 
     @cached_property
     def exact_pattern(self) -> Rows:
-        """[K, Q] values of the pattern as the operator receives them: rounded, and zero for absent views."""
+        """[K, Q] values of the pattern that the operator receives.
+
+        They are rounded, and zero for absent views.
+        """
         return self._rounded(self.pattern)
 
     def gradients(self) -> list[Tensor | None]:

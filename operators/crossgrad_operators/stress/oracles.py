@@ -255,7 +255,10 @@ def _believed(question: Question, pair: tuple[int, int], cosine: Number) -> bool
 
 
 def gradvac(question: Question) -> Vector:
-    """Return the weights of GradVac with the same random order as the operator and with stored targets."""
+    """Return the weights of GradVac with stored targets.
+
+    The random order is the same as in the operator.
+    """
     rows = [
         _aligned(question, i, partners)
         for i, partners in enumerate(partners_of(question, shuffled=True))

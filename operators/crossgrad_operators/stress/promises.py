@@ -42,7 +42,7 @@ APART: Final = 1e-7
 
 @dataclass(frozen=True, eq=False)
 class Facts:
-    """The quantities that define the sets, for n gradients that are not zero and their exact result.
+    """The quantities that define the sets, for n gradients that are not zero and their result.
 
     Attributes:
         norms: [n] lengths of the gradients.
@@ -108,9 +108,11 @@ class Facts:
 
     @property
     def partial(self) -> float:
-        """Sum of the partial sums' lengths |w_1 g_1 + w_2 g_2|, ..., |u| and of all |w_k g_k|, relative to a length.
+        """Sum of the lengths of all partial sums and all terms, relative to a length.
 
-        This length is max(|u|, max |w_k g_k|).
+        The partial sums are w_1 g_1 + w_2 g_2, ..., u, and the terms are w_k g_k.
+
+        The length for the comparison is max(|u|, max |w_k g_k|).
 
         The value is a bound for the rounding errors of all products and additions, in units of u
         kappa.
@@ -127,7 +129,10 @@ class Facts:
 
 
 def default_bound(facts: Facts) -> float:
-    """Return 8, or the rounding error of the weighted sum plus 2 for the weights if this is larger."""
+    """Return 8, or a larger value for many views.
+
+    This value is the rounding error of the weighted sum plus 2 for the weights.
+    """
     return max(PROMISED, facts.partial + 2.0)
 
 
@@ -140,7 +145,7 @@ def pairwise_bound(facts: Facts) -> float:
 
 
 def views_bound(facts: Facts) -> float:
-    """Return the number of views, but at least 8, because sums of equal signs never become shorter."""
+    """Return the number of views, but at least 8. Sums of equal signs never become shorter."""
     return max(PROMISED, float(len(facts.norms)))
 
 

@@ -42,7 +42,10 @@ OPTIONS: Final[Mapping[str, Mapping[str, Any]]] = {
 
 
 def chained(question: Question) -> list[Number]:
-    """Return the weights of the chain in `OPTIONS`, which preconditions, then projects, then averages."""
+    """Return the weights of the chain in `OPTIONS`.
+
+    The chain preconditions, then projects, then averages.
+    """
     factors = oracles.preconditioned(Question(**{**vars(question), "options": {"geometry": 2.0}}))
     inner = _between(question.gramian, factors)
     rows = oracles.projected_rows(Question(**{**vars(question), "gramian": inner}))
@@ -117,6 +120,6 @@ class Views:
 
 
 def sample_views(count: int, seed: int = 0) -> Views:
-    """Return views that are alternately near and far, at distances around the reference distance."""
+    """Return views that are alternately near and far, at distances near the reference distance."""
     labels = tuple(("near", "far")[k % 2] for k in range(count))
     return Views(labels, tuple(0.5 + 0.25 * k for k in range(count)), seed)

@@ -1,4 +1,4 @@
-"""The report of a search, as text."""
+"""Report the results of a search as text."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -7,7 +7,8 @@ from crossgrad_core.commands import write_table
 from crossgrad_operators.stress.search.samples import Sample
 from crossgrad_operators.stress.search.worst_cases import WorstCases
 
-#: Maximum share of random gradients outside a set, and minimum number of gradients for this check.
+#: Largest allowed share of ordinary gradients outside the set, and smallest number of gradients for
+#: this check.
 SHARE, ENOUGH = 0.01, 2000
 
 #: Counts that are columns of the CSV file.
@@ -36,7 +37,7 @@ LEGEND = (
 
 
 def as_text(tallies: Sequence[WorstCases]) -> str:
-    """Return the table, the worst cases of each operator, and the broken promises."""
+    """Return the table, the worst cases of each operator, and the broken guarantees."""
     used = [tally for tally in tallies if tally.matrices]
     worst = [line for tally in used for line in _worst(tally)]
     parts = ["\n".join([_HEAD, *map(_line, used)]), LEGEND, "\n".join(["worst cases:", *worst])]
@@ -44,7 +45,7 @@ def as_text(tallies: Sequence[WorstCases]) -> str:
 
 
 def write_csv(tallies: Sequence[WorstCases], path: Path) -> None:
-    """Write one row per operator and type."""
+    """Write one row for each operator and type."""
     write_table(path, [_row(tally) for tally in tallies])
 
 
@@ -60,7 +61,7 @@ def _row(tally: WorstCases) -> dict[str, str | int | float]:
 
 
 def failed(tally: WorstCases) -> bool:
-    """Return True if a promise was broken."""
+    """Return True if a guarantee was broken."""
     return tally.broken > 0 or _too_often_outside(tally)
 
 
