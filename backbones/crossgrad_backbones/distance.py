@@ -40,8 +40,8 @@ class Conditioned:
     Attributes:
         weights: Name of the tensor that contains the weights [N, ..., 2].
         base: Name of the block to which the weighted terms are added.
-        shape: Shape of the weights of one primitive. Their product with D = (z, z^2) broadcasts to
-            the shape of the base.
+        shape: Shape of the weights of one primitive. The product of the weights with D = (z, z^2)
+            broadcasts to the shape of the base.
     """
 
     weights: str
@@ -57,9 +57,9 @@ COLORS = Conditioned("distance_f_dc", "f_dc", (1, 3, 2))
 def fitted_scale(cameras: Sequence[Camera]) -> Tensor:
     """Return [7] float64 with statistics of the camera distances.
 
-    They are the mean camera centre [3], mean and 1 / standard deviation of log r, and smallest and
-    largest z. Here r is the distance of a camera from the mean centre, and z is the standardised
-    log r.
+    The values are the mean camera centre [3], mean and 1 / standard deviation of log r, and
+    smallest and largest z. Here r is the distance of a camera from the mean centre, and z is the
+    standardised log r.
 
     The last three values are 0 if only one camera exists or all distances are equal.
     """
@@ -80,7 +80,7 @@ def distinguished(scale: Tensor) -> bool:
 def encoded(scale: Tensor, cameras: Sequence[Camera]) -> Tensor:
     """Return the mean of D = (z, z^2) [2] over the cameras.
 
-    z is the standardised log distance of a camera. It is limited to the range of the training
+    z is the standardised log distance of a camera. z is limited to the range of the training
     cameras, because a quadratic function does not extrapolate well.
     """
     centers = torch.stack([camera.center for camera in cameras]).to(scale, non_blocking=True)
@@ -137,7 +137,7 @@ class DistanceConditioned(Vanilla):
     z is the standardised logarithm of the camera's distance from the mean of the training cameras.
     Each Gaussian has weights w, and the dot product of w and D is added to an attribute. The
     attributes are the log scales (with a common term for all three), the opacity logit, and each
-    coefficient of SH degree 0. Each of them has its own weights. All weights start at 0, so that
+    coefficient of SH degree 0. Each attribute has its own weights. All weights start at 0, so that
     the initial model is bit-identical to `vanilla`. Two penalties on the weights increase linearly
     during the run: their squared length, and the squared derivative of the added terms with respect
     to z. Blocks: the blocks of `vanilla`, `distance_scales` [N, 1, 2], `distance_opacities` [N, 2],

@@ -41,16 +41,17 @@ VARIANCE = 0.2
 def filter_widths(means: Tensor, cameras: Sequence[Camera], near: float, *, parity: bool) -> Tensor:
     """Return the standard deviation [N] of each Gaussian's 3-D filter, in local units.
 
-    It is sqrt(VARIANCE) times the smallest z / f over all cameras that see the mean, with depth z
-    and focal length f. Gaussians that no camera sees get the largest value of all other Gaussians,
-    or 0 if no Gaussian is seen.
+    The standard deviation is sqrt(VARIANCE) times the smallest z / f over all cameras that see the
+    mean, with depth z and focal length f. Gaussians that no camera sees get the largest value of
+    all other Gaussians, or 0 if no Gaussian is seen.
 
     Args:
         means: [N, 3] means in local units.
         cameras: The training cameras.
         near: Depth of the near plane in local units.
         parity: True to divide the smallest depth by the longest focal length of all cameras, as in
-            the published code. This camera may not even see the Gaussian.
+            the published code. The camera with the longest focal length may not even see the
+            Gaussian.
     """
     focal = max(camera.fx for camera in cameras) if parity else None
     finest = finest_pixels(means, cameras, near, focal)
@@ -60,7 +61,10 @@ def filter_widths(means: Tensor, cameras: Sequence[Camera], near: float, *, pari
 
 
 def kept_opacity(log_scales: Tensor, widths: Tensor) -> Tensor:
-    """Return the factor [N] by which the filter reduces opacities. It is detached from autograd."""
+    """Return the factor [N] by which the filter reduces opacities.
+
+    The factor is detached from autograd.
+    """
     scales, filters = _finite_scales(log_scales.detach()), _per_axis(widths)
     return (scales / torch.hypot(scales, filters)).prod(1)
 
@@ -75,7 +79,7 @@ def smoothed(log_scales: Tensor, logits: Tensor, widths: Tensor) -> tuple[Tensor
     Args:
         log_scales: [N, 3] logarithms of the scales s.
         logits: [N] logits of the opacities.
-        widths: [N] standard deviations w of the filter. They get no gradient.
+        widths: [N] standard deviations w of the filter. The widths receive no gradient.
     """
     scales_and_opacities: tuple[Tensor, Tensor] = _Smoothed.apply(log_scales, logits, widths)  # type: ignore[no-untyped-call]
     return scales_and_opacities
@@ -135,8 +139,8 @@ class MipSplatting(Vanilla):
     No Gaussian can be smaller than the photos resolve.
 
     Blocks: the blocks of `vanilla`, and `filter` [N]. The filter is the standard deviation of each
-    Gaussian's 3-D filter. It is computed from the training cameras and not trained. Density control
-    uses the scales and opacities before filtering. Source: Mip-Splatting (Yu et al. 2024).
+    Gaussian's 3-D filter. The filter is computed from the training cameras and not trained. Density
+    control uses the scales and opacities before filtering. Source: Mip-Splatting (Yu et al. 2024).
     """
 
     response: ClassVar[Response] = "antialiased"

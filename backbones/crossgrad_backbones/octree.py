@@ -105,7 +105,8 @@ def init_anchors(points: NDArray[np.float64], lattice: Lattice, *, everywhere: b
 def _parted(coarser: NDArray[np.int64], site: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return a mask [P].
 
-    It is True if the points in the coarser site of a point are spread over several finer sites.
+    The mask is True if the points in the coarser site of a point are spread over several finer
+    sites.
 
     Args:
         coarser: [P] number of each point's site on the coarser level.

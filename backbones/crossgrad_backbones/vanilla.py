@@ -158,7 +158,10 @@ class Vanilla(Backbone):
         return self.splats(parameters, phase.schedule.sh_degree(phase.step, self.sh_degree))
 
     def splats(self, parameters: Mapping[str, Tensor], degree: int) -> Gaussians:
-        """Return the Gaussians with spherical harmonics up to `degree`. They are differentiable."""
+        """Return the Gaussians with spherical harmonics up to `degree`.
+
+        The Gaussians are differentiable with respect to the parameters.
+        """
         return Gaussians(
             means=parameters["means"],
             quats=parameters["quats"],

@@ -10,8 +10,8 @@ from crossgrad_core.plugin import Camera
 #: A centre counts as seen if it is inside the image plus a margin. The margin on each side is this
 #: share of the image size.
 MARGIN = 0.15
-#: Smallest depth of a centre that a camera sees, in local units. It equals the default near plane
-#: of the rasterizers.
+#: Smallest depth of a centre that a camera sees, in local units. The value equals the default near
+#: plane of the rasterizers.
 NEAR = 1e-3
 
 

@@ -17,7 +17,7 @@ _FEW: Final = 8
 
 
 def largest(tensor: Tensor) -> Tensor:
-    """Return the largest magnitude as a scalar tensor. It is NaN if an element is NaN."""
+    """Return the largest magnitude as a scalar tensor. The result is NaN if an element is NaN."""
     if not tensor.numel():
         return tensor.new_zeros(())
     size: Tensor = torch.linalg.vector_norm(tensor, inf)

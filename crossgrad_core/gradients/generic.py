@@ -25,7 +25,7 @@ def gramian(column: Column, scale: float = 1.0) -> Tensor:
 def largest(column: Column) -> Tensor:
     """Return [K] float64, the largest magnitude of each gradient.
 
-    It is 0 for a missing or empty gradient.
+    For a missing or empty gradient, the result is 0.
     """
     first = _any(column)
     zero = first.new_zeros((), dtype=torch.float64)

@@ -44,9 +44,9 @@ def column_gramians(columns: Sequence[Column], views: int) -> NDArray[np.float64
 
     Entries of a view with a non-finite gradient are NaN or infinite.
 
-    Products of float32 numbers are exact in float64. They can neither overflow nor underflow. If
-    float64 gradients have magnitudes outside `SAFE`, all gradients are first multiplied by a power
-    of two.
+    Products of float32 numbers are exact in float64. Products of float32 numbers can neither
+    overflow nor underflow in float64. If float64 gradients have magnitudes outside `SAFE`, all
+    gradients are first multiplied by a power of two.
     """
     gramians = np.zeros((len(columns), views, views))
     touched = [t for t, column in enumerate(columns) if any(g is not None for g in column)]

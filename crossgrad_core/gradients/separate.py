@@ -47,7 +47,7 @@ class DenseGradients(SeparateGradients):
             does not touch the tensor.
         blocks: The blocks of the backbone, in the order of the first dimension of Gramians.
         overwrite: True if `combine` and `total` may write their results into the gradients of one
-            view. This saves memory, but the gradients can then be used only once.
+            view. Overwriting saves memory, but the gradients can then be used only once.
     """
 
     def __init__(

@@ -102,7 +102,7 @@ def _union(rows: Sequence[Tensor], count: int) -> Tensor:
 def _on(gradient: Tensor, rows: Tensor) -> Tensor:
     """Return [R, ...], the values of a gradient in `rows`.
 
-    These must include all rows of the gradient.
+    The list `rows` must include all rows of the gradient.
     """
     gradient_rows, values = rows_of(gradient), values_of(gradient)
     if len(gradient_rows) == len(rows):

@@ -27,7 +27,10 @@ def sigmoid(values: Tensor) -> Tensor:
 
 
 class _Sigmoid(torch.autograd.Function):
-    """The sigmoid with its gradient. Both have the same bits for any number of threads."""
+    """The sigmoid with its gradient.
+
+    The sigmoid and the gradient have the same bits for any number of threads.
+    """
 
     @staticmethod
     @override
@@ -45,7 +48,10 @@ class _Sigmoid(torch.autograd.Function):
 
 
 def logsigmoid(values: Tensor) -> Tensor:
-    """Return the logarithm of the sigmoid. It is accurate even if the sigmoid rounds to 0."""
+    """Return the logarithm of the sigmoid.
+
+    The logarithm is accurate even if the sigmoid rounds to 0.
+    """
     return _in_blocks(functional.logsigmoid, values)
 
 

@@ -15,8 +15,8 @@ R = TypeVar("R")
 
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 _COMPILE = cast("Callable[..., Any]", njit)
-#: These flags allow fused multiply-add and ignore the sign of zero. All other arithmetic follows
-#: IEEE 754 in the order of the source code. Checks for NaN and infinity therefore work.
+#: The flags allow fused multiply-add and ignore the sign of zero. All other arithmetic follows IEEE
+#: 754 in the order of the source code. Checks for NaN and infinity therefore work.
 _FLAGS = {"contract", "nsz"}
 
 
@@ -31,9 +31,12 @@ def compiled(function: Callable[P, R], **options: Any) -> Callable[P, R]:  # noq
 
 
 def inlined(function: Callable[P, R], **options: Any) -> Callable[P, R]:  # noqa: ANN401
-    """Compile a function that kernels call. Its code becomes part of the calling kernel."""
-    # Do not compile wrappers for calls from Python and C. They are not used, and take a quarter of
-    # the compilation time.
+    """Compile a function that kernels call.
+
+    The code of the function becomes part of the calling kernel.
+    """
+    # Do not compile wrappers for calls from Python and C. The wrappers would not be used, and would
+    # take a quarter of the compilation time.
     whole = {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return cast("Callable[P, R]", _COMPILE(**whole, **options, **_OPTIONS)(function))
 
@@ -41,18 +44,23 @@ def inlined(function: Callable[P, R], **options: Any) -> Callable[P, R]:  # noqa
 def strict_kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a kernel with IEEE arithmetic in the order of the source code.
 
-    It runs on the calling thread.
+    The kernel runs on the calling thread.
     """
     return compiled(function)
 
 
 def strict_device(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a function that strict kernels call. Its code becomes part of the calling kernel."""
+    """Compile a function that strict kernels call.
+
+    The code of the function becomes part of the calling kernel.
+    """
     return inlined(function)
 
 
 def strict_section(function: Callable[P, R]) -> Callable[P, R]:
-    """Mark a section of a strict kernel. Its code is inserted before the kernel is compiled.
+    """Mark a section of a strict kernel.
+
+    The code of the section is inserted before the kernel is compiled.
 
     Functions from `strict_part` and `strict_device` are optimized separately, and again in each
     calling function. For a large function, each optimization takes seconds.
@@ -63,7 +71,7 @@ def strict_section(function: Callable[P, R]) -> Callable[P, R]:
 def strict_part(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a separate function that only strict kernels call.
 
-    It is not inserted into its callers.
+    The function is not inserted into the code of its callers.
     """
     return compiled(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
@@ -71,7 +79,7 @@ def strict_part(function: Callable[P, R]) -> Callable[P, R]:
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a kernel that may fuse multiplications and additions.
 
-    It runs on the calling thread.
+    The kernel runs on the calling thread.
     """
     return compiled(function, fastmath=_FLAGS)
 
@@ -79,7 +87,7 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
 def part(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a separate function that only kernels from `kernel` call.
 
-    It is not inserted into its callers.
+    The function is not inserted into the code of its callers.
     """
     return compiled(function, fastmath=_FLAGS, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
@@ -87,7 +95,7 @@ def part(function: Callable[P, R]) -> Callable[P, R]:
 def device(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function that kernels from `kernel` call.
 
-    Its code becomes part of the calling kernel.
+    The code of the function becomes part of the calling kernel.
     """
     return inlined(function, fastmath=_FLAGS)
 
@@ -103,6 +111,6 @@ def sum_kernel(function: Callable[P, R]) -> Callable[P, R]:
 def sum_device(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function with sums that kernels call.
 
-    Its sums may use vector lanes, and signs of zero are preserved.
+    Sums in the function may use vector lanes, and signs of zero are preserved.
     """
     return inlined(function, fastmath={"reassoc", "contract"})

@@ -13,9 +13,9 @@ can take longer than the computation with one thread. Here, a helper thread that
 not waited for, and idle threads sleep.
 
 Each thread begins with its own range of jobs, and then continues with jobs from the ranges of other
-threads. A thread therefore often reads data that it wrote in the previous kernel. These data are
-still in the cache of its core. The result of a job must not depend on the thread that executes the
-job. The number of threads then does not change any bit of the results.
+threads. A thread therefore often reads data that it wrote in the previous kernel. Data from the
+previous kernel are still in the cache of the thread's core. The result of a job must not depend on
+the thread that executes the job. The number of threads then does not change any bit of the results.
 """
 # ruff: noqa: ANN401, ARG001 - Numba's objects have no types, and Numba defines the arguments.
 
@@ -79,7 +79,7 @@ def next_job(jobs: Jobs, count: int) -> int:
 def _jobs(threads: int) -> list[Jobs]:
     """Return an array of counters for each thread.
 
-    It contains the number of threads, and how many jobs were taken from each thread's range.
+    The array contains the number of threads, and how many jobs were taken from each thread's range.
 
     All arrays share the same memory block. A thread derives its own number from the length of its
     array.
@@ -144,7 +144,7 @@ class Begun:
 class _Call:
     """A call for a helper thread.
 
-    It is skipped if it is no longer needed when the thread starts it.
+    The call is skipped if its result is no longer needed when the thread starts it.
 
     A plain lock is used, because a `Future` creates condition variables for each call and each
     wait.
@@ -180,10 +180,11 @@ class _Call:
 
 
 class _Helpers:
-    """The helper threads of a process. They use other cores than the calling thread.
+    """The helper threads of a process. Helper threads use other cores than the calling thread.
 
-    When a thread wakes another thread, Linux first starts the woken thread on the same core. It
-    moves the thread to an idle core later. This delay is longer than the time of most kernels.
+    When a thread wakes another thread, Linux first starts the woken thread on the same core. Linux
+    moves the woken thread to an idle core later. The move to an idle core takes longer than most
+    kernels.
     """
 
     def __init__(self) -> None:

@@ -216,7 +216,7 @@ def fingerprint(source: Path) -> str:
     """Return the SHA-256 of all source files that may affect a kernel in `source`.
 
     Numba itself detects changes of the kernel's file, but not of files whose functions are inlined.
-    The hash includes all files of the kernel's folder. It also includes the files that these files
+    The hash includes all files of the kernel's folder. The hash also includes all files that they
     import from their own package or from the core. If an imported file is in a folder of kernels,
     the files that it imports are included as well.
     """

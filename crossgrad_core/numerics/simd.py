@@ -1,7 +1,7 @@
 """SIMD vectors of eight or sixteen float32 lanes for compiled kernels.
 
 Numba relies on LLVM's loop vectoriser. The vectoriser fails for compositing loops, because each
-iteration depends on the previous iteration. This module therefore defines vector types: `Lanes` for
+iteration depends on the previous iteration. The module therefore defines vector types: `Lanes` for
 float32 numbers, and `Mask` for truth values. A kernel that uses these types always compiles to SIMD
 instructions. A vector of eight lanes uses one AVX register. LLVM splits it on machines with
 narrower registers. Functions whose names end in `_wide` create vectors of sixteen lanes. With
@@ -102,7 +102,7 @@ class _MaskModel(models.PrimitiveModel):
 class Site(NamedTuple):
     """The place where a function is called.
 
-    It contains Numba's context, LLVM's builder, and the Numba types of the operands.
+    A `Site` contains Numba's context, LLVM's builder, and the Numba types of the operands.
     """
 
     context: Any
@@ -114,8 +114,8 @@ def emitted(emit: Callable[..., Any], result: Any, *operands: Any) -> Any:
     """Create a function that kernels can call.
 
     Args:
-        emit: Function that emits the instructions. It receives the `Site` and the operands' LLVM
-            values.
+        emit: Function that emits the instructions. The function receives the `Site` and the
+            operands' LLVM values.
         result: Numba type of the result, such as `SIXTEEN`. `_lanes` and `_mask` mean a vector with
             as many lanes as the operands' vectors.
         operands: Numba types of the operands, also with `_lanes` and `_mask`. None means any array.

@@ -15,11 +15,12 @@ def configure_threads(n: int | None = None) -> int:
     """Set the number of threads for Numba's kernels and torch's operators.
 
     Kernels of crossgrad divide their work with `jobs.parallel`. Plugins may use `prange` loops. For
-    these loops, Numba uses OpenMP if it can be loaded, else TBB, else its own "workqueue". This
-    choice is left to the environment if `NUMBA_THREADING_LAYER` or `NUMBA_THREADING_LAYER_PRIORITY`
-    is set. It also cannot change after the first parallel kernel. Numba stores the number of
-    threads for each calling thread. Every other thread that runs kernels must also call this
-    function. After the call, freed memory stays in the process (see `keep_freed_memory`).
+    these loops, Numba uses OpenMP if it can be loaded, else TBB, else its own "workqueue". The
+    choice of the threading layer is left to the environment if `NUMBA_THREADING_LAYER` or
+    `NUMBA_THREADING_LAYER_PRIORITY` is set. After the first parallel kernel, the threading layer
+    cannot change any more. Numba stores the number of threads for each calling thread. Every other
+    thread that runs kernels must also call this function. After the call, freed memory stays in the
+    process (see `keep_freed_memory`).
 
     Args:
         n: Number of threads. None uses NUMBA_NUM_THREADS or OMP_NUM_THREADS if one is set, else the

@@ -49,7 +49,7 @@ def without_blank_photos(split: Split, sources: Mapping[str, PhotoSource], root:
     A note names the removed photos.
 
     The function reads masks and decodes photos with transparency. Held-out photos stay in the
-    split. Their metrics report that no pixel is valid.
+    split. The metrics of a held-out photo that is masked completely report that no pixel is valid.
 
     Raises:
         UserError: No training photo has a valid pixel.
@@ -281,7 +281,7 @@ def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
 def _labels(raw: RawScene, photos: ChosenPhotos, points: CheckedPoints) -> Label:
     """Return a function that labels views before the split is known.
 
-    It uses a local frame of all cameras.
+    The function uses a local frame of all cameras.
     """
     views = sorted((v for v in raw.views if v.name in photos.sources), key=lambda view: view.name)
     names = [view.name for view in views]

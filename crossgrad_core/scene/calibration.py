@@ -15,8 +15,8 @@ from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
 if TYPE_CHECKING:
     import pycolmap
 
-# These models are pinhole cameras if all their distortion parameters are 0. Fisheye models are not
-# listed. With zero parameters, they use an equidistant projection, although pycolmap's
+# Camera models that are pinhole cameras if all their distortion parameters are 0. Fisheye models
+# are not listed. With zero parameters, they use an equidistant projection, although pycolmap's
 # `is_undistorted` is True.
 _PINHOLE_AT_ZERO = frozenset(
     {"SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION", "DIVISION"}
@@ -216,8 +216,8 @@ class Calibration:
         import pycolmap
 
         options = pycolmap.UndistortCameraOptions()
-        # This call also raises an error for models that cannot be undistorted, before `_reach` is
-        # computed.
+        # The call of `_undistorted` also raises an error for models that cannot be undistorted,
+        # before `_reach` is computed.
         smallest = self._undistorted(options).width <= options.min_scale * self.width
         if smallest and (self._reach.folds or self._reach.wide):
             options.min_scale = 1.0

@@ -46,8 +46,8 @@ class FileMark(_Mark):
         bytes: Size of the file in bytes.
         sha256: Digest of the first and the last 64 KiB of the file. Runs of all versions store this
             digest.
-        whole: Digest of the complete file. It is None if `sha256` already covers the complete file,
-            and in fingerprints of earlier versions.
+        whole: Digest of the complete file. The digest is None if `sha256` already covers the
+            complete file, and in fingerprints of earlier versions.
     """
 
     bytes: int
@@ -102,7 +102,7 @@ class Fingerprint(_Mark):
         points: Summary of the SfM points.
         lists: Name of a split list -> digest of its file.
         files: Path relative to the scene's folder -> file, for all files that the reader used
-            except photos and masks. It is None in fingerprints of earlier versions.
+            except photos and masks. In fingerprints of earlier versions, `files` is None.
         views: Name of a view -> its split, camera and files.
     """
 

@@ -20,9 +20,9 @@ _SMALLEST = 1e-30
 
 # Local coordinates are rounded to multiples of this number, 1e-9 of the scene extent. If the same
 # scene is given in other units or with another origin, float64 results differ in their last bits.
-# These differences are 1e3 to 1e7 times smaller than the rounding step, so that nearly all rounded
-# coordinates are equal. The rounding step is 60 times smaller than the spacing of float32 numbers
-# near 1.
+# Differences in the last bits are 1e3 to 1e7 times smaller than the rounding step, so that nearly
+# all rounded coordinates are equal. The rounding step is 60 times smaller than the spacing of
+# float32 numbers near 1.
 _GRID = 2.0**-30
 
 

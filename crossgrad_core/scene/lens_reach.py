@@ -31,13 +31,13 @@ class LensReach:
     """The rays that a lens model maps to unique pixels.
 
     A lens model folds over at the angle from which the distorted radius no longer grows with the
-    undistorted radius. Rays beyond the fold hit pixels that other rays hit as well. Their pixels
-    therefore show no image content of their own.
+    undistorted radius. Rays beyond the fold hit pixels that other rays hit as well. Pixels of rays
+    beyond the fold therefore show no image content of their own.
 
     Attributes:
         limits: [A] for each direction, the tangent of the largest angle from the axis before the
-            fold. The directions are evenly spread over the circle. They start at the right and turn
-            downwards.
+            fold. The directions are evenly spread over the circle. The first direction points to
+            the right, and the next directions turn downwards.
         folds: True if the fold is inside the photo in any direction.
         wide: True if the photo covers 90 degrees or more from the axis in any direction.
         box: Smallest and largest x, then smallest and largest y, of the rays inside the photo, at

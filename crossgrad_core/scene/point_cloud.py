@@ -67,7 +67,7 @@ class PointCloud:
         positions: [P, 3] float64.
         colors: [P, 3] uint8.
         source: Name of the file; empty if there are no points.
-        gaussians: True if the file contains Gaussians. Their colours are not read.
+        gaussians: True if the file contains Gaussians. Colours of Gaussians are not read.
     """
 
     positions: NDArray[np.float64]
@@ -138,7 +138,7 @@ def _colors(columns: Mapping[str, NDArray[np.generic]], count: int) -> NDArray[n
 def read_las(path: Path) -> dict[str, NDArray[np.generic]]:
     """Read the columns x, y and z of the points.
 
-    Also read red, green and blue if the file contains colours.
+    If the file contains colours, also read red, green and blue.
 
     Raises:
         UserError: laspy is missing, or the file cannot be read.
@@ -206,8 +206,8 @@ def thinned(points: CheckedPoints, most: int) -> tuple[CheckedPoints, list[str]]
 
     Of all points in a cube of a grid, one is kept.
 
-    This is the first point of the cube in the order of the file. Equal files therefore give equal
-    points.
+    The kept point is the first point of the cube in the order of the file. Equal files therefore
+    give equal points.
     """
     count = len(points.xyz)
     if count <= most:

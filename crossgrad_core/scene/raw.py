@@ -18,7 +18,8 @@ from crossgrad_core.scene.wording import count, name_some
 #: Coordinates above this number of input units are invalid, because their squares could overflow
 #: float64.
 FARTHEST = 1e30
-#: Largest allowed coordinate in local units. Its square does not overflow float32.
+#: Largest allowed coordinate in local units. The square of this coordinate does not overflow
+#: float32.
 FARTHEST_LOCAL = 1e15
 #: Largest number of bytes that usual file systems allow for a file or folder name, and for a
 #: complete path.
@@ -58,7 +59,7 @@ class RawScene:
 
     Attributes:
         root: Folder of the scene. The folder may contain split lists and the default mask folder.
-            Its name becomes the scene's name.
+            The name of the folder becomes the scene's name.
         images: Folder of the photos. The neighbouring folders `<images>_2`, `_4` and `_8` may
             contain smaller copies.
         views: The images with poses, in any order.

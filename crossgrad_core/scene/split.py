@@ -52,9 +52,9 @@ def split_views(
     """Split views as the option `split` requires. At least one view is a training view.
 
     `auto` first uses list files or the split that the input prescribes. Without such a split,
-    `auto` holds out every n-th photo of each folder. This may hold out fewer than two photos of a
-    regime. If a split by regime would hold out two or more, `auto` holds out every n-th photo of
-    each regime instead.
+    `auto` holds out every n-th photo of each folder. Such a split by folder may hold out fewer than
+    two photos of a regime. If a split by regime would hold out two or more, `auto` holds out every
+    n-th photo of each regime instead.
 
     Args:
         names: Names of all views that can be used.
@@ -82,7 +82,7 @@ def split_views(
 def _by_regime(every: Split, names: Sequence[str], options: SceneOptions, label: Label) -> Split:
     """Return the split by regime if the option requires it.
 
-    Also return it if a regime has too few held-out views.
+    The split by regime is also returned if a regime has too few held-out views.
     """
     regimes = label(names)
     stratified = _split_stratified(names, options.test_every, regimes)

@@ -304,7 +304,7 @@ def _grown(parameters: Parameters) -> Parameters:
 def fitting_respects_the_user(make: Make[Backbone]) -> None:
     """`fitted_to` returns a note for each changed option.
 
-    It never changes an option that the user set.
+    `fitted_to` never changes an option that the user set.
     """
     backbone = make()
     fitted, notes = backbone.fitted_to(sample_scene())

@@ -109,7 +109,7 @@ def _announced_at(entry: registry.Entry) -> str:
 def _failed(check: str, error: BaseException, package: str, where: str) -> Result:
     """Return a failed result.
 
-    Its location is the innermost line of the package, or else `where`.
+    The location of the failure is the innermost line of the package, or else `where`.
     """
     where = raised_at(error, package) or where
     if isinstance(error, AssertionError):

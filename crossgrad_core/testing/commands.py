@@ -1,6 +1,7 @@
 """Contract checks for commands, which entry points in `crossgrad.commands` register.
 
-These checks receive the command itself, `check(my_command)`, and not a function that creates it.
+Checks of commands receive the command itself, `check(my_command)`, and not a function that creates
+the command.
 """
 
 import subprocess

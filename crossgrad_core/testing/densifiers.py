@@ -59,7 +59,9 @@ _GRADIENT = 5e-5
 
 @dataclass
 class DensifierRun:
-    """A densifier that is called step by step, as in a training run. Its edits are applied.
+    """A densifier that is called step by step, as in a training run.
+
+    The edits of the densifier are applied to the parameters.
 
     Attributes:
         densifier: The densifier.
@@ -166,7 +168,7 @@ def _screen(gaussians: int, needs: frozenset[str], seed: tuple[int, int]) -> Scr
 def _directions(radii: Tensor, gradient: Tensor, rng: np.random.Generator) -> Tensor:
     """Create up to four pixels in each of the six bins.
 
-    Their absolute gradients sum to twice the absolute value of `gradient`.
+    The absolute gradients of these pixels sum to twice the absolute value of `gradient`.
     """
     shape = (radii.shape[0], 6, 4)
     angles = torch.from_numpy(rng.uniform(0.0, 2.0 * np.pi, shape)).float()

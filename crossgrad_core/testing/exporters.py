@@ -48,7 +48,7 @@ def writes_one_file(make: Make[Exporter]) -> None:
 
 
 def appears_at_once(make: Make[Exporter]) -> None:
-    """An existing file is replaced as a whole. It is never overwritten in place."""
+    """An existing file is replaced as a whole. The exporter never overwrites a file in place."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "a"
         make().write(_gaussians(), _FRAME, path, ())
@@ -87,7 +87,7 @@ def writes_the_input_frame(make: Make[Exporter]) -> None:
 def what_it_writes_is_read_again(make: Make[Exporter]) -> None:
     """`read` returns positions, sizes and opacities of the result of `stored`.
 
-    They may differ by float32 rounding.
+    The values may differ by float32 rounding.
     """
     exporter = make()
     if type(exporter).read is Exporter.read:

@@ -149,7 +149,7 @@ def posed_view(
 ) -> View:
     """Create a 4 x 4 view at `center` [3].
 
-    It looks along `forward` [3], and its top is towards `up` [3].
+    The view looks along `forward` [3], and its top is towards `up` [3].
     """
     z = _unit(np.asarray(forward, dtype=np.float64))
     x = _unit(np.cross(z, np.asarray(up, dtype=np.float64)))

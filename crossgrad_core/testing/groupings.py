@@ -22,7 +22,7 @@ from crossgrad_core.wording import listed
 
 @dataclass(frozen=True)
 class SampleProbe:
-    """Artificial gradients of views. They agree within a regime and conflict between regimes.
+    """Artificial gradients of views. Gradients agree within a regime and conflict between regimes.
 
     Attributes:
         scene: The scene whose views have the regimes.

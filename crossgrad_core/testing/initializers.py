@@ -22,7 +22,7 @@ def adds_points(make: Make[Initializer]) -> None:
     """Each added point has a position, a colour, a size above 0, and an opacity between 0 and 1.
 
     The size and the opacity may also be NaN. An initializer with `alone = True` is also tested on a
-    scene without points. It may raise an error there if it finds no points.
+    scene without points. If such an initializer finds no points, it may raise an error.
     """
     start = make()
     _require_points(start.more_points(sample_scene()))

@@ -42,7 +42,7 @@ def its_columns_are_its_own(make: Make[Metric]) -> None:
 def measures_a_finite_number(make: Make[Metric]) -> None:
     """For every view, the result is a finite number or None.
 
-    This also holds if the render equals the photo.
+    The result is also valid if the render equals the photo.
     """
     photo = sample_scene().test_views[0].photo.image()
     for render in (_render(), photo, torch.zeros_like(photo)):

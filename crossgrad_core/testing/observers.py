@@ -82,7 +82,7 @@ _VIEWS = (0, 4)
 _STEPS = (*range(1, 17), 50, 100, 500, 600, 1_000, 7_000, 15_000, STEPS)
 
 
-#: Hooks that are called inside a training step. Their time counts as training time.
+#: Hooks that are called inside a training step. The time of these hooks counts as training time.
 _ON_THE_CLOCK = {
     "crossgrad_sample_views",
     "crossgrad_choose_scales",

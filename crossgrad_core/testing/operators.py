@@ -1,8 +1,8 @@
 """Contract checks for operators.
 
 The Gramians belong to gradients that occur in training. Gradients may be zero, equal, opposite,
-very long, very short, or of very different lengths. They may also span fewer dimensions than there
-are views.
+very long, very short, or of very different lengths. Gradients may also span fewer dimensions than
+there are views.
 """
 
 from collections.abc import Iterator
@@ -307,7 +307,7 @@ def what_it_reads_is_declared(make: Make[Operator]) -> None:
 
     If an operator declares that it does not read an input, this input has no effect.
 
-    These declarations matter: a run refuses a grouping if no component reads labels, and a
+    The declarations matter: a run refuses a grouping if no component reads labels, and a
     granularity if no component reads Gramians.
     """
     operator = _matrix_operator(make)

@@ -13,7 +13,7 @@ from crossgrad_core.testing.support.contract import Check, ContractError, Make, 
 def foreign_folders_are_not_accepted(make: Make[Reader]) -> None:
     """`accepts` returns False for an empty folder, a missing folder, and a file.
 
-    It never raises an error.
+    `accepts` never raises an error.
     """
     with TemporaryDirectory() as folder:
         file = Path(folder) / "notes.txt"

@@ -113,8 +113,8 @@ _LOG = logging.getLogger(__name__)
 PROBE_STEPS = 12
 #: Minimum share of the time budget that the timed steps at the start use.
 PROBE_SHARE = 0.01
-#: Kernels may be compiled during the timed steps. This is the maximum number of restarts after a
-#: compilation.
+#: Kernels may be compiled during the timed steps. After a compilation, the timed steps are
+#: restarted, at most this number of times.
 _TRIES = 8
 #: Minimum share of the time budget between two time measurements.
 LOOK_SHARE = 0.02

@@ -127,9 +127,9 @@ _VIEWS, _STEPS = 8, 2
 class Prefetcher:
     """A prefetcher of photos: it predicts the next views and lets threads decode their photos.
 
-    It draws the next views with copies of the sampler's random generator and state. The prediction
-    only decides which photos are decoded first. The prediction may be wrong if the sampler uses the
-    losses of the previous step. The prefetcher does not change the training state.
+    The prefetcher draws the next views with copies of the sampler's random generator and state. The
+    prediction only decides which photos are decoded first. The prediction may be wrong if the
+    sampler uses the losses of the previous step. The prefetcher does not change the training state.
 
     Args:
         setup: Setup of the run.
@@ -197,7 +197,7 @@ class Prefetcher:
 Ending = Literal["finished", "stopped", "paused"]
 #: Number of steps between two checks of all parameters. Losses and gradients are checked in every
 #: step. A non-finite parameter may affect neither the loss nor the gradients, for example if its
-#: Gaussian is no longer rendered. This check finds such a parameter.
+#: Gaussian is no longer rendered. The check of all parameters finds such a parameter.
 CHECK_EVERY = 10
 #: Number of steps between two copies of the last good state. The number is a multiple of
 #: `CHECK_EVERY`.

@@ -19,9 +19,10 @@ _Size = tuple[int, int]
 class ScaledPhotos:
     """A cache of reduced photos.
 
-    It stores the last requested size of each photo, and a copy from which nearby sizes are made.
+    The cache stores the last requested size of each photo, and a copy from which nearby sizes are
+    made.
 
-    This copy is halved repeatedly, but is at least as large as the requested size. If the requested
+    The copy is halved repeatedly, but is at least as large as the requested size. If the requested
     size changes in small steps, the halved copy is made only once.
 
     Args:

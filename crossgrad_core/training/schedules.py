@@ -25,7 +25,7 @@ def schedule_of(
     The densifier chooses when edits occur. Settings by the user override this choice.
 
     Args:
-        config: The configuration. Its settings of the schedule, edits and SH bands are used.
+        config: The configuration. The settings of the schedule, edits and SH bands are used.
         densifier: The densifier, which chooses when edits occur.
         steps: Number of steps of the run.
         counting: Number of views in each step, and number of photos.

@@ -50,8 +50,8 @@ class Scale:
     """The scale of an operator's result for K views, by tensor name.
 
     Attributes:
-        per_step: c(K), the factor of the operator for K equal gradients. It is K for a sum and 1
-            for a mean.
+        per_step: c(K), the factor of the operator for K equal gradients. The factor is K for a sum
+            and 1 for a mean.
         per_view: c(K) / K.
         to_sum: K / |c(K)|, a factor that makes the result as large as the sum of the views'
             gradients. Adam receives the scaled result, because eps and the numerical limits of Adam
@@ -78,10 +78,10 @@ class Scale:
 class OperatorScale:
     """The factors c(K): the sum of an operator's weights for K equal gradients.
 
-    The operator is called once for each combination of K and labels. It receives K equal gradients
-    with one element per tensor, and an empty state. In this call, the views differ only in their
-    labels. This measurement works for every operator, also for chains, plugins, and operators that
-    act on blocks or elements.
+    The operator is called once for each combination of K and labels. In this call, the operator
+    receives K equal gradients with one element per tensor, and an empty state. In this call, the
+    views differ only in their labels. The measurement works for every operator, also for chains,
+    plugins, and operators that act on blocks or elements.
 
     Args:
         operator: The operator to measure.
@@ -125,7 +125,7 @@ class OperatorScale:
 def neutral(context: AggregateContext) -> AggregateContext:
     """Return an artificial context of step 1.
 
-    Its K views have equal gradients, losses, distances and image sizes.
+    The K views of the context have equal gradients, losses, distances and image sizes.
     """
     views = len(context.losses)
     names = [name for block in context.blocks for name in block.tensors]

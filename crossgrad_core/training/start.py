@@ -277,7 +277,7 @@ def thinned(scene: Scene, share: float, rng: np.random.Generator) -> Scene:
 def start_notes(setup: Setup, state: TrainState) -> tuple[str, ...]:
     """Return a note if the run does not start with all primitives that its points would give.
 
-    Also return a note if a PLY file contains more Gaussians than the limit allows.
+    If a PLY file contains more Gaussians than the limit allows, a note is returned, too.
     """
     kept, most = state.states.get(THINNED), setup.config.max_gaussians
     if kept is None:
@@ -317,8 +317,8 @@ def unwatched(setup: Setup) -> Setup:
 def warm_up(setup: Setup, reached: TrainState | None = None) -> float:
     """Compile all kernels that the run needs, by taking steps with temporary states.
 
-    Photos are decoded at the same time. This saves time, because compilers run one at a time and
-    release the interpreter lock.
+    Photos are decoded at the same time. Decoding at the same time saves time, because compilers run
+    one at a time and release the interpreter lock.
 
     Args:
         setup: Setup of the run.

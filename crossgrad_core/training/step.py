@@ -133,7 +133,9 @@ STREAM = "density"
 def observed_views(
     setup: Setup, state: TrainState, records: Sequence[ViewRecord]
 ) -> tuple[ViewRecord, ...]:
-    """Return the records of views for density control. They include an extra view if one is due.
+    """Return the records of views for density control.
+
+    The records include an extra view if one is due.
 
     Raises:
         NonFiniteError: The loss of the extra view is not finite.
@@ -480,7 +482,8 @@ def _finish(
         _optimize(setup, state, rendered, gradients, scale)
         gradients.clear()
         if setup.schedule.densifies(state.step):
-            # Finish the background updates first. Their gradients use memory that an edit needs.
+            # Finish the background updates first. The gradients of running updates use memory that
+            # an edit needs.
             state.late.finish()
         edit, edited = _densify(setup, state, rendered)
     else:

@@ -248,9 +248,9 @@ def joined(
 ) -> TensorGradients:
     """Return the aggregated gradients plus the gradients of the regularization terms.
 
-    The terms are multiplied by the operator's factor c(K). Their weight relative to the photometric
-    loss therefore does not depend on the operator. The factor is c(K) for terms of the whole step,
-    and c(K) / K for terms of a view.
+    The terms are multiplied by the operator's factor c(K). The weight of the terms relative to the
+    photometric loss therefore does not depend on the operator. The factor is c(K) for terms of the
+    whole step, and c(K) / K for terms of a view.
 
     Args:
         gradients: The aggregated gradients of the photometric losses.
@@ -579,7 +579,9 @@ def _learning(setup: Setup, state: TrainState) -> Parameters:
 
 
 def observe_view(setup: Setup, state: TrainState, draw: ViewSample, scale: float) -> ViewRecord:
-    """Render the single view of `draw` to collect its statistics. Its gradients are discarded.
+    """Render the single view of `draw` to collect its statistics.
+
+    The gradients of this view are discarded.
 
     Raises:
         NonFiniteError: The loss of the view is not finite.
@@ -600,7 +602,8 @@ def _regularize_view(setup: Setup, state: TrainState, drawn: _Drawn, into: Tenso
 
 
 def _backward(loss: Tensor) -> None:
-    # If no Gaussian is visible, the image is constant and has no gradients. This is not an error.
+    # If no Gaussian is visible, the image is constant and has no gradients. A view without visible
+    # Gaussians is not an error.
     if loss.requires_grad:
         loss.backward()  # type: ignore[no-untyped-call]
 

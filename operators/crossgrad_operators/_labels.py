@@ -31,8 +31,8 @@ def label_objections(
     if selection.sampler.own_labels:
         source, given = f"sampler {sampler}", selection.sampler.own_labels
     elif grouping is not None:
-        # A grouping by folders or lists takes its labels from the scene. Its own `labels` are
-        # empty.
+        # A grouping by folders or lists takes its labels from the scene. The field `labels` of such
+        # a grouping is empty.
         source = f"grouping {selection.names['grouping']}"
         given = grouping.labels if selection.labels is None else selection.labels
     else:

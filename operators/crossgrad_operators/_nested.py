@@ -1,6 +1,6 @@
 """Operators that contain other operators.
 
-They are built from names or options, and their states are nested.
+Inner operators are built from names or options, and their states are nested.
 """
 
 from collections.abc import Iterable, Mapping

@@ -72,7 +72,7 @@ def doubted(kernel: CautiousKernel, gramians: Floats, context: OperatorContext) 
 class Kernel(Protocol):
     """A kernel that returns weights, and True for blocks with ill-conditioned weights.
 
-    Its arguments are Gramians, residuals, presence, and True for 32 digits.
+    The arguments of the kernel are Gramians, residuals, presence, and True for 32 digits.
     """
 
     def __call__(

@@ -22,8 +22,9 @@ from crossgrad_operators.projection import project, slot_order
 class Anchors(GramianOperator):
     """The operator `symmetric` for a near and a far anchor view, and `sum` for other pairs.
 
-    Use this operator with the sampler `anchors-30`. Its anchors are the nearest and the farthest 30
-    % of the cameras. The gradients of the remaining cameras are added without a projection.
+    Use this operator with the sampler `anchors-30`. The anchors of this sampler are the nearest and
+    the farthest 30 % of the cameras. The gradients of the remaining cameras are added without a
+    projection.
     """
 
     views: ClassVar[ViewCounts] = ViewCounts(2, 2)

@@ -19,9 +19,9 @@ _THRESHOLDS: Final = {"v2": 0.9, "low": 0.6}
 class ConfGate(GramianOperator):
     """Project a pair of views only if it conflicts now and has probably conflicted for some time.
 
-    The mean mu and variance v of the cosine of a pair are bias-corrected exponential averages. They
-    correspond to n_eff = (1 + beta) / (1 - beta) samples. The probability of a conflict is P =
-    Phi(-mu / sqrt(v / n_eff + 1e-12)), with the normal distribution function Phi. If the dot
+    The mean mu and variance v of the cosine of a pair are bias-corrected exponential averages. The
+    averages correspond to n_eff = (1 + beta) / (1 - beta) samples. The probability of a conflict is
+    P = Phi(-mu / sqrt(v / n_eff + 1e-12)), with the normal distribution function Phi. If the dot
     product m is negative and P >= tau, the pair is processed as in `symmetric`, otherwise as in
     `sum`. A pair is not projected during its first `warmup` updates. Steps with m = 0 do not count
     as updates, for example if the gradients share no non-zero element.

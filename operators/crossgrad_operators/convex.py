@@ -39,12 +39,12 @@ class MGDA(Weighting):
 class CAGrad(Weighting):
     """The direction near the mean gradient that best decreases every loss.
 
-    It maximizes the smallest decrease over all views.
+    The direction maximizes the smallest decrease over all views.
 
     With the mean g_0, d maximizes min_k g_k.d subject to |d - g_0| <= c |g_0|. The solution is d =
     g_0 + (c |g_0| / |g_w|) g_w. Here g_w is the convex combination that minimizes g_w.g_0 + c |g_0|
     |g_w|. For two views, a closed form is used. For more views, all products g_k.d must reach a
-    common level. d is the point nearest to g_0 in this polyhedron. This point is found by an
+    common level. d is the point nearest to g_0 in this polyhedron. The nearest point is found by an
     active-set method, with 32 digits for float64 gradients. A single view is unchanged.
 
     Source: Liu et al. 2021, "Conflict-averse gradient descent for multi-task learning".

@@ -59,7 +59,8 @@ def _as_mapping(rules: tuple[Rule, ...]) -> dict[str, object]:
 class Dispatch(GramianOperator):
     """A different operator for each block.
 
-    It comes from a rule for the block, from a rule for its kind, or from the variant.
+    The operator of a block comes from a rule for the block, from a rule for its kind, or from the
+    variant.
 
     The paper has two variants: `geometry-confgate` uses `confgate` for geometry and `sum` for
     appearance. `geometry-projection` uses `symmetric` for geometry and `confgate` for appearance.
@@ -155,7 +156,7 @@ class Dispatch(GramianOperator):
     def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
         """Return the objections of all operators.
 
-        Also return objections to rules for blocks that do not exist.
+        Rules for blocks that do not exist cause objections, too.
         """
         reasons = [
             reason

@@ -20,10 +20,10 @@ class Symmetric(GramianOperator):
 
     In a conflicting pair, each gradient loses its component along the other gradient.
 
-    For m = g_1.g_2 < 0, g_1' = g_1 - (m / |g_2|^2) g_2 and g_2' = g_2 - (m / |g_1|^2) g_1. These
-    are the equations proj_near, proj_far and final_update of the paper, which equal PCGrad for two
-    tasks. With more than two views, every ordered pair is projected in the order of the views in
-    the step. The other gradient of a pair is always the original gradient.
+    For m = g_1.g_2 < 0, g_1' = g_1 - (m / |g_2|^2) g_2 and g_2' = g_2 - (m / |g_1|^2) g_1. The
+    equations proj_near, proj_far and final_update of the paper have this form, and equal PCGrad for
+    two tasks. With more than two views, every ordered pair is projected in the order of the views
+    in the step. The other gradient of a pair is always the original gradient.
 
     The paper CrossGrad-GS (arXiv 2605.00052) uses this operator as its main operator.
     """

@@ -144,11 +144,9 @@ def baked(
 ) -> Gaussians:
     """Convert anchors to plain Gaussians.
 
-    The values of an anchor are averaged over the cameras that see the anchor.
-
-    In the average of opacities, a camera that does not render a Gaussian counts with 0. Scales,
-    rotations and colours are averaged with the opacities as weights. Colours use spherical
-    harmonics of degree 0 and 1.
+    The values of an anchor are averaged over the cameras that see the anchor. In the average of
+    opacities, a camera that does not render a Gaussian counts with 0. Scales, rotations and colours
+    are averaged with the opacities as weights. Colours use spherical harmonics of degree 0 and 1.
     The values of an anchor that no camera sees are averaged over all cameras.
 
     Args:

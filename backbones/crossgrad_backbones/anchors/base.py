@@ -30,8 +30,8 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: Near plane, and dilation in px^2, of the frustum filter. Both equal the defaults of the
-#: rasterizers.
+#: Near plane, and dilation in px^2, of the frustum filter. The near plane and the dilation equal
+#: the defaults of the rasterizers.
 NEAR, DILATION = 1e-3, 0.3
 #: At this number of standard deviations from its centre, the alpha of an opaque Gaussian equals the
 #: alpha threshold.
@@ -44,9 +44,10 @@ _HALF_PIXEL = 0.5
 def in_frustum(positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
     """Return a mask [P] of the anchors whose own Gaussian would be visible in the image.
 
-    Each anchor is treated as an opaque, unrotated Gaussian. Its scales are the scales of the
-    anchor's offsets. This Gaussian is projected with the formulas of the rasterizers. An anchor is
-    in the frustum if the bounding box of the footprint (alpha >= 1/255) contains a pixel centre.
+    Each anchor is treated as an opaque, unrotated Gaussian. The scales of this Gaussian are the
+    scales of the anchor's offsets. The Gaussian of an anchor is projected with the formulas of the
+    rasterizers. An anchor is in the frustum if the bounding box of the footprint (alpha >= 1/255)
+    contains a pixel centre.
 
     Args:
         positions: [P, 3] positions in local units.
@@ -64,7 +65,8 @@ def in_frustum(positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
 def _axes(camera: Camera) -> list[tuple[float, ...]]:
     """Return six values for x and six for y.
 
-    They are focal length, principal point, two slope limits, and first and last pixel centre.
+    The six values are focal length, principal point, two slope limits, and first and last pixel
+    centre.
     """
     sizes = ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))
     axes: list[tuple[float, ...]] = []
@@ -144,7 +146,8 @@ class AnchorBackbone(AnchorOptions):
     F]; scales [P, 6] (logarithms: three for the offsets, three for the size of Gaussians);
     mlp_opacity, mlp_cov, mlp_color and, if enabled, mlp_bank (four tensors each); voxel_size
     (frozen). The published code also stores a rotation and an opacity for each anchor, but never
-    trains them. They are left out here. Source: Scaffold-GS (Lu et al. 2024).
+    trains them. Rotations and opacities of anchors are left out here. Source: Scaffold-GS (Lu et
+    al. 2024).
     """
 
     positions: ClassVar[str] = "anchors"

@@ -39,7 +39,8 @@ class _Back:
     """Sums of gradients over all anchors, and buffers for one stretch (a fixed number of anchors).
 
     Attributes:
-        heads: Numbers of the output networks that receive a gradient. They are consecutive.
+        heads: Numbers of the output networks that receive a gradient. The numbers of these heads
+            are consecutive.
         features: [Q, F] sum of gradients with respect to the features.
         first: Sums of gradients with respect to the first layers.
         second: Sums of gradients with respect to the second layers of `heads`, concatenated.
@@ -122,7 +123,7 @@ def backward(inputs: Inputs, kept: Kept, given: Gradients) -> Gradients:
         Gradients with respect to features, offsets, log scales, weight and bias of the first
         layers, and weight and bias of each second layer. If only the scales have a gradient (volume
         regularization), the gradients of the offsets, the opacity network and the colour network
-        are None. They are not computed.
+        are None. These gradients are not computed, which saves time.
     """
     alone = all((gradient is not None) == (i == _SCALES) for i, gradient in enumerate(given))
     back = _Back.of(inputs, kept, (_COVARIANCE,) if alone else _HEADS)
@@ -183,7 +184,7 @@ class _Decode(torch.autograd.Function):
 def gaussians_of(view: View, *tensors: Tensor) -> Gaussians:
     """Return the Gaussians with positive opacity.
 
-    They are differentiable with respect to all tensors.
+    The Gaussians are differentiable with respect to all tensors.
 
     Args:
         view: The constant inputs.
@@ -228,7 +229,7 @@ def decoded(
 def _fusible(parameters: Mapping[str, Tensor]) -> bool:
     """Return True if fused decoding is possible.
 
-    It requires float32 on the CPU and fixed anchors.
+    Fused decoding requires float32 on the CPU and fixed anchors.
     """
     names = ("anchors", "offsets", "features", "scales")
     tensors = [parameters[name] for name in names]

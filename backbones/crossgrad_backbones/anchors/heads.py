@@ -59,7 +59,7 @@ class Network:
     def created(self, rng: np.random.Generator) -> Parameters:
         """Draw initial values as `torch.nn.Linear` does.
 
-        They are uniform in +-1 / sqrt(inputs of the layer).
+        The initial values are uniform in +-1 / sqrt(inputs of the layer).
         """
         tensors: Parameters = {}
         widths = ((self.inputs, self.hidden), (self.hidden, self.outputs))
@@ -220,9 +220,9 @@ def activated(
 ) -> Gaussians:
     """Return the Gaussians with positive opacity, in the order of anchors and slots.
 
-    Gaussian j of anchor a has the mean x_a + offset_aj exp(l1_a) and the opacity tanh(raw). Its
-    scales are exp(l2_a) sigmoid(raw), and its colour is sigmoid(raw). Quaternions are not
-    normalised, because rasterizers accept any length.
+    Gaussian j of anchor a has the mean x_a + offset_aj exp(l1_a) and the opacity tanh(raw). The
+    scales of Gaussian j are exp(l2_a) sigmoid(raw), and its colour is sigmoid(raw). Quaternions are
+    not normalised, because rasterizers accept any length.
 
     Args:
         raw: Raw outputs for A anchors with k Gaussians each.
@@ -262,7 +262,7 @@ def product(left: Tensor, right: Tensor) -> Tensor:
     The number n must be a multiple of `PANEL`.
 
     Each panel of `PANEL` rows is summed separately. A matrix library would split one long sum over
-    all threads. Its rounding would then depend on the number of threads.
+    all threads. The rounding of such a sum would depend on the number of threads.
     """
     first, second = (torch.unflatten(matrix, 0, (-1, PANEL)) for matrix in (left, right))
     return torch.bmm(first.transpose(1, 2), second).sum(0)

@@ -27,7 +27,7 @@ CODES, POSES = "appearance", "appearance_poses"
 
 
 class AnchorOptions(Backbone):
-    """The options of Scaffold-GS. Their default values are the published values."""
+    """The options of Scaffold-GS. The default values of the options are the published values."""
 
     default_densifier: ClassVar[str] = "anchor"
 
@@ -151,7 +151,8 @@ def code_of(codes: Tensor, poses: Tensor, camera: Camera, *, training: bool) -> 
     """Return the code [C] of a training view during training. In evaluations, return the mean code.
 
     Scaffold-GS evaluates a held-out view with the code of the training view that has the same
-    index. These two views are unrelated, so the mean code is used here instead.
+    index. The held-out view and this training view are unrelated. Here, a held-out view gets the
+    mean code instead.
 
     Args:
         codes: [V, C] codes of the training views.

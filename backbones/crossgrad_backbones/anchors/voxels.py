@@ -10,8 +10,8 @@ SMALLEST_VOXEL = 1e-5
 #: Automatic voxel size of a cloud with a single point, in local units.
 LONE_VOXEL = 0.01
 #: Automatic voxel size, relative to the median distance between neighbouring points. With a factor
-#: of 1, nearly every point would become an anchor. This would be too many Gaussians, because an
-#: anchor has ten Gaussians, but `vanilla` has one Gaussian per point.
+#: of 1, nearly every point would become an anchor. Nearly every point as an anchor would give too
+#: many Gaussians: an anchor has ten Gaussians, but `vanilla` has one Gaussian per point.
 SPACING = 2.0
 #: Cells at least this number of cells from the origin are left out, because their integer
 #: coordinates would not be exact.
@@ -22,7 +22,8 @@ def automatic_voxel_size(points: NDArray[np.float64]) -> float:
     """Return twice the median distance from a point to its nearest neighbour, in local units.
 
     Scaffold-GS instead takes the median of the mean *squared* distance to three neighbours as a
-    length. This value depends on the unit of the input, so it is not used here.
+    length. The median of squared distances depends on the unit of the input, so it is not used
+    here.
 
     Args:
         points: [N, 3] points in local units.
@@ -68,8 +69,8 @@ def in_reach(cells: Tensor) -> Tensor:
 def numbered(cells: Tensor) -> Tensor:
     """Return numbers [N] int64 that are equal exactly if the cells [N, 3] are equal.
 
-    The columns are processed one after another, so that no product overflows. This is much faster
-    than `unique` for complete rows.
+    The columns are processed one after another, so that no product overflows. Numbering the columns
+    is much faster than `unique` for complete rows.
     """
     number = cells.new_zeros(cells.shape[0])
     for column in cells.unbind(1):
@@ -81,7 +82,7 @@ def numbered(cells: Tensor) -> Tensor:
 def free_cells(wanted: Tensor, taken: Tensor) -> tuple[Tensor, Tensor]:
     """Return the distinct empty cells among the wanted cells.
 
-    Also return which of them each wanted cell is.
+    Also return, for each wanted cell, its position among these distinct cells.
 
     Args:
         wanted: [N, 3] int64 wanted cells.

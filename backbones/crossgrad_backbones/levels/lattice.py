@@ -27,7 +27,7 @@ def root_cell(edge: float, base_layer: int, wanted: float) -> float:
         edge: Edge of the cube in local units.
         base_layer: Number of times the cube is halved. With -1, it is halved until cells have about
             the edge `wanted`.
-        wanted: Wanted edge in local units. It is also the result if the cube has no size.
+        wanted: Wanted edge in local units. If the cube has no size, `wanted` is the result.
     """
     if edge <= 0.0:
         return wanted
@@ -52,8 +52,8 @@ class Lattice:
         levels: [] number of levels.
         distance: [] standard distance D in local units. At this distance, L* = log_fork(D /
             distance) is 0.
-        lead: [] how many levels above L* a camera uses. It is 0 if L* is rounded down, 1/2 if L* is
-            rounded to the nearest level, and 1 if L* is rounded up.
+        lead: [] how many levels above L* a camera uses. `lead` is 0 if L* is rounded down, 1/2 if
+            L* is rounded to the nearest level, and 1 if L* is rounded up.
         visible_share: [] an anchor is pruned if at most this share of the cameras uses its level.
     """
 
@@ -185,7 +185,7 @@ def distance_range(
         ratio: Quantile for the largest distance, for instance 0.999.
 
     Returns:
-        The standard distance D and the smallest distance d. Both are positive.
+        The standard distance D and the smallest distance d. Both distances are positive.
     """
     quantiles = (1.0 - ratio, ratio)
     pooled = [np.quantile(np.linalg.norm(points - c, axis=1), quantiles) for c in centers]
@@ -218,8 +218,8 @@ def bounding_range(points: NDArray[np.float64]) -> tuple[float, float]:
 def automatic_root_cell(points: NDArray[np.float64]) -> float:
     """Return four times the median distance between neighbouring points, in local units.
 
-    This is twice the automatic voxel size of `scaffold`. The most distant cameras then use anchors
-    that are about as dense as the points, for any number of finer levels.
+    The result is twice the automatic voxel size of `scaffold`. The most distant cameras then use
+    anchors that are about as dense as the points, for any number of finer levels.
 
     Args:
         points: [P, 3] points in local units.

@@ -3,8 +3,8 @@
 Gradients are passed by their memory addresses. `addresses` [T, K] int64 contains the address of
 view k's gradient of tensor t, or 0 if the view does not touch the tensor. `sizes` [T] contains the
 number of elements of each tensor. The work is split into chunks of `CHUNK` elements. Partial sums
-are added in the order of the chunks, for any number of threads. The same input therefore gives
-bit-identical results.
+are added in the order of the chunks, for any number of threads. The same gradients therefore give
+bit-identical results with any number of threads.
 """
 
 from typing import Any
@@ -112,7 +112,7 @@ def _chunk_gramian(addresses: Ints, start: int, length: int, compact: Floats, ou
 def summed(partial: Floats, table: Ints, tensors: int) -> Floats:
     """Return [T, K, K], the sums of the chunks' Gramians with Neumaier compensation.
 
-    Both triangles are filled.
+    The sums contain both triangles.
 
     Args:
         partial: [C, K, K] Gramians of the chunks, upper triangles only.
@@ -211,8 +211,8 @@ def spread_gramian(
                 if addresses[k] != 0:
                     places[k] = dense.ctypes.data + 4 * k * CHUNK
             _chunk_gramian(places, 0, length, compact, partial[c])
-            # Numba frees an array after the last line that names it. This line keeps `dense` alive
-            # while its address is used.
+            # Numba frees an array after the last line that names it. The assignment keeps `dense`
+            # alive while its address is used.
             dense[0] = np.float32(0.0)
         c = next_job(jobs, chunks)
 
@@ -346,8 +346,8 @@ def _combine_chunk(
         for i in range(result.size):
             result[i] = 0.0
     elif count == 2 and (out == rows[0] or out == rows[1]):
-        # This is the most common case: two views, and the result overwrites the gradient of one
-        # view. The order of two summands does not change the sum.
+        # The most common situation: there are two views, and the result overwrites the gradient of
+        # one view. The order of two summands does not change the sum.
         this = 0 if out == rows[0] else 1
         a, b = row(out, first, end - first), row(rows[1 - this], first, end - first)
         if plain:

@@ -1,8 +1,8 @@
 """Gramians with twice as many digits as float64, for operators that need them.
 
 Products are added one at a time. The rounding errors of products and sums are added separately
-(Ogita, Rump and Oishi 2005). The results are as exact as with 106-bit arithmetic. These sums take
-ten times as long as plain sums.
+(Ogita, Rump and Oishi 2005). The results are as exact as with 106-bit arithmetic. Sums of this kind
+take ten times as long as plain sums.
 """
 
 import numpy as np
@@ -41,7 +41,8 @@ def left_over(high: Floats, low: Floats, gramians: Floats) -> Floats:
 
     Only the upper triangles of `high` and `low` are used.
 
-    Both triangles of `gramians` are used, because matrix products may round them differently.
+    Both triangles of `gramians` are read, because matrix products may round the triangles
+    differently.
     """
     result = np.zeros(gramians.shape)
     blocks, views, _ = gramians.shape

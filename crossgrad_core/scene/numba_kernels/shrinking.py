@@ -1,9 +1,9 @@
 """Resize images to a smaller size like scikit-image with anti-aliasing, row by row (Numba, CPU).
 
 As in `transform.resize`, a Gaussian filter is applied along the columns and then along the rows.
-The result is interpolated linearly. Only the rows that interpolation needs are filtered. This
-avoids a float image in the size of the photo. Every sum uses the order and the rounding of SciPy,
-so that the results are bit-identical.
+The result is interpolated linearly. Only the rows that interpolation needs are filtered. A float
+image in the size of the photo is therefore not needed. Every sum uses the order and the rounding of
+SciPy, so that the results are bit-identical.
 """
 
 import numpy as np
@@ -100,7 +100,7 @@ def _columns(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Return the left and right neighbour [w C] of each output value.
 
-    Also return the weight of the left neighbour.
+    The weight of the left neighbour is the third result.
     """
     left, right = np.empty(columns * channels, np.int64), np.empty(columns * channels, np.int64)
     near = np.empty(columns * channels)

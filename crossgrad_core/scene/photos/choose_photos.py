@@ -37,7 +37,7 @@ from crossgrad_core.scene.photos.shapes import check_mask, choose_reduction, is_
 from crossgrad_core.scene.raw import RawScene
 from crossgrad_core.scene.wording import count, name_some
 
-#: Photos in 16-bit files may contain values of fewer bits. They are recognised if their largest
+#: Photos in 16-bit files may contain values of fewer bits. Fewer bits are recognised if the largest
 #: value reaches this share of a smaller range. The bit depth of darker photos is ambiguous.
 _REACHED: Final = 0.8
 #: If the largest value is above this number, the photos use all 16 bits.

@@ -157,7 +157,7 @@ def _decode(path: Path, read: "Callable[[Image], T]", reduction: int = 1) -> T:
 def _decode_deep(path: Path) -> tuple[NDArray[np.int32], Pixels | None]:
     """Decode a photo with 16 bits to grey [H, W, 1] or RGB [H, W, 3].
 
-    Also return its alpha channel with 8 bits, if there is one.
+    If the photo has an alpha channel, return it with 8 bits.
     """
     upper = _decode(path, np.array)
     if upper.ndim == 2:  # noqa: PLR2004 - grey, which Pillow decodes to 16 bits

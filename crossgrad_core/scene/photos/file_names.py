@@ -15,7 +15,7 @@ from typing import Final, TypeAlias
 
 from crossgrad_core.scene.photos.pillow import SUFFIXES
 
-#: Similarity of a file's path to a name; greater is more similar. Its elements are: equal folders,
+#: Similarity of a file's path to a name; greater is more similar. The elements are: equal folders,
 #: number of equal folders at the end, whether one path ends with the other path, equal base name
 #: except letter case, equal base name.
 _Likeness: TypeAlias = tuple[bool, int, bool, bool, bool]

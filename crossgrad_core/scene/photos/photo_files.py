@@ -157,8 +157,8 @@ def pair_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
 def find_mask_folder(option: Path | None, root: Path) -> Path | None:
     """Return the mask folder.
 
-    It is the folder of the option, as a path or relative to the scene, or else `<scene>/masks` if
-    it exists.
+    The mask folder is the folder of the option, as a path or relative to the scene. Without the
+    option, it is `<scene>/masks`, if this folder exists.
 
     Raises:
         UserError: The folder that the option names does not exist.

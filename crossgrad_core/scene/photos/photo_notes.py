@@ -35,7 +35,7 @@ def note_pairing(
 ) -> list[str]:
     """Note posed images without a photo and photos without a pose.
 
-    Also note photos whose names differ in suffix or letter case.
+    Photos whose names differ in suffix or letter case are noted, too.
     """
     absent = [name for name in names if name not in paths]
     used_paths = frozenset(used)

@@ -209,7 +209,7 @@ def _entries(folder: Path) -> Iterator[tuple[float, int, Path]]:
 def _packed(decoded: Decoded) -> list[bytes | memoryview]:
     """Return the parts of an entry as bytes.
 
-    They are a file signature, a CRC-32 checksum, the pixels, and one bit per pixel for a mask.
+    The parts are a file signature, a CRC-32 checksum, the pixels, and one bit per pixel for a mask.
     """
     image, mask = decoded
     pixels = image.contiguous().numpy().reshape(-1).data

@@ -28,8 +28,8 @@ from crossgrad_core.scene.photos.decode import (
 from crossgrad_core.scene.photos.photo_store import Decoded, PhotoStore, Storable, made_by
 from crossgrad_core.scene.photos.shapes import is_turned
 
-#: To test a JPEG file, it is decoded at an eighth of its width and height. This is faster, but
-#: still reads all data of the file.
+#: To test a JPEG file, it is decoded at an eighth of its width and height. Decoding at an eighth of
+#: the size is faster, but still reads all data of the file.
 SMALLEST = 8
 _OPAQUE, _HALF = 255, 128
 #: Seconds that a thread waits for a photo while another thread decodes the photo.
@@ -137,7 +137,7 @@ class PhotoSource:
         return image, torch.from_numpy(resize(keep, *self.target) >= _HALF)
 
     def try_out(self) -> None:
-        """Test whether the photo and its mask can be decoded. This takes less time than `decode`.
+        """Test whether the photo and its mask can be decoded. A test takes less time than `decode`.
 
         Raises:
             UserError: The photo or its mask is damaged.
@@ -215,7 +215,10 @@ class PhotoCache(Generic[Key]):
         return self._used
 
     def expect(self, sources: Iterable[Key]) -> None:
-        """Announce the photos that will be requested next. These photos are removed last."""
+        """Announce the photos that will be requested next.
+
+        The announced photos are removed from memory last.
+        """
         self._expected = frozenset(sources)
 
     def holds(self, source: Key) -> bool:
@@ -225,7 +228,7 @@ class PhotoCache(Generic[Key]):
     def get(self, source: Key) -> Decoded:
         """Return the decoded photo and mask of `source`.
 
-        They are shared, so the caller must not change them.
+        The photo and the mask are shared, so the caller must not change them.
 
         If another thread is decoding the photo, this call waits for a short time and then decodes
         the photo itself. The wait is limited, because the other thread has low priority and may not
@@ -289,7 +292,10 @@ class PhotoCache(Generic[Key]):
 
 @dataclass(frozen=True, eq=False)
 class FilePhoto(Photo):
-    """A photo in a file. It is decoded when it is requested, and the scene's cache stores it."""
+    """A photo in a file.
+
+    The photo is decoded when it is requested, and the scene's cache stores the decoded photo.
+    """
 
     source: PhotoSource
     cache: PhotoCache[PhotoSource]

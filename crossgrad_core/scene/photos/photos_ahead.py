@@ -74,7 +74,7 @@ class PhotosAhead:
     def expect(self, views: Sequence[View]) -> None:
         """Announce the next views in the order in which steps use them.
 
-        This replaces all earlier announcements.
+        The new list of views replaces all earlier announcements.
         """
         photos = [view.photo for view in views if isinstance(view.photo, FilePhoto)]
         if not photos:

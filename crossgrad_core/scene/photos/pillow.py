@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 
-#: Largest number of pixels of a photo. It is Pillow's default limit, and an RGB photo of this size
-#: needs 0.5 GB.
+#: Largest number of pixels of a photo. The limit is Pillow's default limit, and an RGB photo of
+#: this size needs 0.5 GB.
 MOST_PIXELS: Final = 178_956_970
 # Formats that cameras and mask tools write. Pillow supports more formats, but some of them start
 # external programs.

@@ -31,8 +31,8 @@ _SMALL: Final = 16
 #: Two photos are almost equal if the mean difference of their pixels is below this number of levels
 #: of 255.
 _ALMOST: Final = 0.5
-#: A photo counts as blurred if its sharpness is below this share of the median sharpness. It counts
-#: as dark or bright if its brightness differs from the median by more than `_STOPS` stops.
+#: A photo counts as blurred if its sharpness is below this share of the median sharpness. A photo
+#: counts as dark or bright if its brightness differs from the median by more than `_STOPS` stops.
 _BLURRED: Final = 0.15
 _STOPS: Final = 4.0
 #: With fewer photos, no median is computed.
@@ -69,7 +69,8 @@ class Sketches:
 def _grid(height: int, width: int) -> Integers:
     """Return one-dimensional pixel indices [3, 16, 16].
 
-    They are a grid, the right neighbours of its pixels, and pixels farther to the right.
+    The indices belong to a grid, to the right neighbours of its pixels, and to pixels farther to
+    the right.
     """
     shares = (np.arange(_SMALL) + 0.5) / _SMALL
     down = (shares * height).astype(np.int64)

@@ -235,7 +235,7 @@ def other_axes() -> Iterator[Trial]:
 def searches() -> Iterator[Search]:
     """Yield searches for unknown numbers.
 
-    These are logarithms of factors, then offsets as shares of width and height.
+    The unknown numbers are logarithms of factors, then offsets as shares of width and height.
     """
     for make, most in ((_focal, 5.0), (_scaled, 100.0), (_resized, 10.0)):
         steps = np.arange(-np.log(most), np.log(most), _FACTOR)
@@ -382,8 +382,8 @@ def _scaled(factor: float) -> Trial:
     return Trial(
         f"points and camera positions have different units: {factor:.3g} times the points fit",
         "write points and camera positions in the same units",
-        # Dividing the translations has the same effect on the image as multiplying the points. It
-        # also allows a different factor for each camera.
+        # Dividing the translations has the same effect on the image as multiplying the points.
+        # Dividing the translations also allows a different factor for each camera.
         lambda rig: replace(rig, translations=rig.translations / factor),
     )
 

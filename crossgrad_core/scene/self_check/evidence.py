@@ -37,8 +37,8 @@ _IN_A_CELL, _CELLS = 6, 64
 FLAT: Final = 4.0
 Booleans: TypeAlias = NDArray[np.bool_]
 Photo: TypeAlias = tuple[NDArray[np.uint8], Booleans | None]
-#: Function that decodes the photo of a view. It returns the pixels [H, W, 3] uint8 and, if some
-#: pixels are masked, the mask [H, W] bool.
+#: Function that decodes the photo of a view. The function returns the pixels [H, W, 3] uint8 and,
+#: if some pixels are masked, the mask [H, W] bool.
 Pixels: TypeAlias = Callable[[int], Photo]
 
 
@@ -203,7 +203,7 @@ class Evidence:
     def sees_nothing(self, cameras: Integers) -> Booleans:
         """Return a mask of `cameras`.
 
-        It is True if none of the scene's points is inside the photo.
+        The mask is True if none of the scene's points is inside the photo.
         """
         rows = np.broadcast_to(np.arange(len(self.rig.points)), (1, len(self.rig.points)))
         return np.array(

@@ -202,7 +202,7 @@ class _Group:
     def bad(self) -> Booleans:
         """[V] True for photos that disagree.
 
-        Their correlation is low, and their colours deviate too much.
+        The correlation of such a photo is low, and its colours deviate too much.
         """
         correlation, noise = self.agreement.correlation, self.agreement.noise
         low = np.nan_to_num(correlation, nan=1.0) < _BAD * self.better

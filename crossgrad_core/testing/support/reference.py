@@ -2,8 +2,8 @@
 
 The inputs are ordinary Gaussians, cameras with unusual intrinsics, and extreme Gaussians that occur
 in training. A pixel may differ from the reference for two reasons. First, rounding can add or
-remove a few Gaussians at the edge of their footprints. Second, float32 has rounding errors. Their
-size is measured by running the reference itself in float32.
+remove a few Gaussians at the edge of their footprints. Second, float32 has rounding errors. The
+size of rounding errors is measured by running the reference itself in float32.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -22,7 +22,7 @@ from crossgrad_core.registry.entries import build
 from crossgrad_core.testing.fixtures import sample_camera, sample_gaussians, sample_scene
 from crossgrad_core.testing.support.contract import Check, ContractError, Make, cannot_tell, require
 
-#: Largest allowed difference between a pixel and the reference. Such a difference occurs if
+#: Largest allowed difference between a pixel and the reference. A difference of this size occurs if
 #: rounding adds or removes a few Gaussians at the edge of their footprints.
 _PIXEL = 0.02
 #: Largest allowed mean difference of pixels, and largest allowed relative difference of gradients.

@@ -34,7 +34,7 @@ def renders_of(
 ) -> RenderOnRequest:
     """Create the function `render` of a context.
 
-    It uses a black background, no exposure and the default loss.
+    The renders use a black background, no exposure and the default loss.
     """
     loss = build(Loss, LOSS, {})
 
@@ -88,7 +88,7 @@ def view_record(
 ) -> ViewRecord:
     """Create the record of a view with given statistics.
 
-    Its photo, render and background are black.
+    The photo, the render and the background of the record are black.
 
     Args:
         view: The view.

@@ -48,8 +48,8 @@ def adam_step(  # noqa: PLR0913 - all options of an optimizer step are arguments
         rule: Decay rates of the moments, and eps.
         scales: Factor for the gradient of each tensor, by name; not 0. None means a factor of 1 for
             all tensors.
-        from_zero: Names of uninitialised tensors that have a gradient. Their values are set to zero
-            before the step.
+        from_zero: Names of uninitialised tensors that have a gradient. The values of these tensors
+            are set to zero before the step.
 
     Raises:
         ValueError: If an argument is out of range or a gradient does not have the shape and type of

@@ -31,8 +31,8 @@ class Coefficients:
         age: Number of steps t in the bias correction, including this step.
         eps: Constant added to the square root of the corrected second moment.
         scale: Factor for the gradient.
-        from_zero: True if the tensor is uninitialised. Its values are then set to zero before the
-            step.
+        from_zero: True if the tensor is uninitialised. The values of an uninitialised tensor are
+            set to zero before the step.
     """
 
     beta1: float

@@ -68,9 +68,8 @@ class _Behind:
         later = steps[::-1]
         most = np.maximum.accumulate(later[:, 2])[::-1]
         least = np.minimum.accumulate(later[:, 3])[::-1]
-        # These bounds are valid if the first moment decays faster than the square root of the
-        # second moment. In addition, the second moment must stay a normal number between two
-        # checks.
+        # The bounds are valid if the first moment decays faster than the square root of the second
+        # moment. In addition, the second moment must stay a normal number between two checks.
         beta1, beta2 = steps[:, 0], steps[:, 1]
         fades = bool(((beta1 <= np.sqrt(beta2)) & (beta2 >= LEAST_BETA2)).all())
         most = most if fades else np.full_like(most, inf)
@@ -119,9 +118,10 @@ class Late:
         still be running after this function returns; `finish` waits for the end of the step.
 
         Args:
-            name: Name of the tensor. Its step count in `adam` already includes this step.
+            name: Name of the tensor. The step count of the tensor in `adam` already includes this
+                step.
             param: The tensor, float32 and contiguous, on the CPU.
-            grad: The sparse gradient. It must not change after this call.
+            grad: The sparse gradient. The gradient must not change after this call.
             adam: Moments and step counts.
             step: The coefficients of the step.
         """

@@ -32,7 +32,7 @@ def directions(
 ) -> int:
     """Write the norms [K] and the cosines [K, K] of the gradients.
 
-    Both are zero for views without a gradient.
+    The norms and cosines of views without a gradient are zero.
 
     Args:
         gramian: [K, K] Gramian.
@@ -105,7 +105,7 @@ def present_in(problem: Polyhedron) -> int:
 def what_is_left(problem: Polyhedron, x: Pairs) -> float:
     """Return a factor for the coefficients x.
 
-    It is 0 if only rounding noise of opposite directions remains.
+    The factor is 0 if only rounding noise of opposite directions remains.
 
     Two directions are opposite if 1 + cos is at most 1e-12. `share_left` contains the rule for more
     than two directions.

@@ -111,8 +111,8 @@ def solve_shifted(matrix: Floats, right: Floats, out: Floats) -> None:
 def smallest_pivot(cosines: Floats, count: int) -> float:
     """Return the last pivot of a Cholesky factorization with pivoting; the result is at least 0.
 
-    The pivot is an upper bound of the smallest eigenvalue of the first `count` rows and columns. It
-    is rarely more than `count` times as large.
+    The pivot is an upper bound of the smallest eigenvalue of the first `count` rows and columns.
+    The pivot is rarely more than `count` times as large as this eigenvalue.
     """
     rest = cosines[:count, :count].copy()
     pivot = 1.0
@@ -190,9 +190,9 @@ def eigen(matrix: Pairs, vectors: Pairs, exact: Exact) -> Floats:
 
     The diagonal of `matrix` also contains them.
 
-    The function uses Jacobi's method. It stops when |a_ij| <= eps sqrt(a_ii a_jj) for all elements
-    a_ij. With this rule, small eigenvalues of a matrix D C D also have small relative errors, for
-    any diagonal D and a well-conditioned C (Demmel and Veselic 1992).
+    The function uses Jacobi's method. The method stops when |a_ij| <= eps sqrt(a_ii a_jj) for all
+    elements a_ij. With this rule, small eigenvalues of a matrix D C D also have small relative
+    errors, for any diagonal D and a well-conditioned C (Demmel and Veselic 1992).
 
     Args:
         matrix: [n, n] matrix, overwritten.

@@ -56,9 +56,9 @@ class Rounding(NamedTuple):
 
     Attributes:
         exact: True for 32 digits, None for 16 digits.
-        ridge: Number that is added to the diagonal of the cosine matrix. It exceeds the rounding
-            error of a zero eigenvalue, also for long sums. It is still too small to affect
-            gradients that have half as many digits.
+        ridge: Number that is added to the diagonal of the cosine matrix. The ridge exceeds the
+            rounding error of a zero eigenvalue, also for long sums. The ridge is still too small to
+            affect gradients that have half as many digits.
         slack: A constraint counts as violated if the violation exceeds this share of its terms.
         shown: The effect of the ridge is corrected if the ridge exceeds this share of a pivot.
         noise: Rounding error of |sum x_k e_k|^2, relative to sum x_k^2. Opposite gradients with
@@ -200,7 +200,8 @@ def substitute(problem: Polyhedron, count: int, right: Pairs, out: Pairs) -> Non
 def _first_zero(problem: Polyhedron, count: int) -> tuple[float, int]:
     """Return the share of the step after which a multiplier becomes zero.
 
-    Also return the number of its constraint. Without such a multiplier, return (1, -1).
+    The second result is the number of the constraint to which this multiplier belongs. Without such
+    a multiplier, return (1, -1).
     """
     share, leaving = 1.0, -1
     for i in range(count):
@@ -328,10 +329,12 @@ def square(problem: Polyhedron, x: Pairs) -> Pair:
 
 @strict_part
 def share_left(problem: Polyhedron, x: Pairs) -> float:
-    """Return a factor for coefficients x. It is 0 if their sum is only rounding noise.
+    """Return a factor for coefficients x.
 
-    Above the noise, the factor increases continuously. It reaches 1 when the squared length is
-    twice the noise.
+    The factor is 0 if the sum of the directions, weighted by x, is only rounding noise.
+
+    Above the noise, the factor increases continuously. The factor reaches 1 when the squared length
+    is twice the noise.
     """
     noise = problem.rounding.noise * products(x, x, 0, problem.active.size, None)[0]
     if noise == 0.0:

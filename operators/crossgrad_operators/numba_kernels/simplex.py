@@ -1,9 +1,10 @@
 """Kernels for minima over convex combinations of the gradients (MGDA, CAGrad).
 
 Weights w with w >= 0 and sum w = 1 are stored as x_k = w_k |g_k| / s, where s is the smallest norm.
-In this form, the combination is sum x_k e_k for unit gradients e_k. It depends only on the cosines,
-for any ratio of norms. The constraint is sum_k r_k x_k = 1 with r_k = s / |g_k|. Up to a factor,
-both methods need the nearest point in a polyhedron {x: x.e_k >= level r_k}:
+In this form, the combination is sum x_k e_k for unit gradients e_k. In this form, the combination
+depends only on the cosines, for any ratio of norms. The constraint is sum_k r_k x_k = 1 with r_k =
+s / |g_k|. Up to a factor, both methods need the nearest point in a polyhedron {x: x.e_k >= level
+r_k}:
 
 - MGDA: for any level, the point nearest to 0 has the direction of the shortest combination.
 - CAGrad: let d be the direction that maximizes min_k g_k.d in the ball with radius rho around g_0.
@@ -183,8 +184,8 @@ def _change(problem: Polyhedron, count: int, search: Search, level: Pair, ridge:
     The active constraints are assumed not to change.
 
     With the derivative a = C^-1 r of the multipliers, the squared distance is a quadratic function
-    of this change. The change is infinite if no constraint is active. It is also infinite if the
-    rounding errors of very large multipliers exceed the distance.
+    of this change. The change is infinite if no constraint is active. The change is also infinite
+    if the rounding errors of very large multipliers exceed the distance.
     """
     exact, slope = problem.rounding.exact, problem.step
     substitute(problem, count, search.r, slope)
@@ -192,7 +193,7 @@ def _change(problem: Polyhedron, count: int, search: Search, level: Pair, ridge:
     for i in range(count):
         k = problem.chosen[i]
         y, a, r = at(problem.y, k), at(slope, k), at(search.r, k)
-        # For active constraints, C y + q - level r + ridge (y - centre) = 0. This equation gives C
+        # For active constraints, C y + q - level r + ridge (y - centre) = 0. The equation gives C
         # y, and its derivative gives C a.
         pull = minus((ridge * y[0], ridge * y[1]), (ridge * problem.centre[k, 0], 0.0), exact)
         force = minus(product(level, r, exact), plus(at(search.q, k), pull, exact), exact)
@@ -210,7 +211,7 @@ def _change(problem: Polyhedron, count: int, search: Search, level: Pair, ridge:
 def _is_beyond_reach(problem: Polyhedron, search: Search) -> bool:
     """Return True if only the ridge keeps the multipliers bounded.
 
-    Their sum is then rounding noise.
+    The sum of such multipliers is rounding noise.
     """
     total = 0.0
     for k in range(len(search.r)):
@@ -236,7 +237,7 @@ def _repeats(problem: Polyhedron, before: Flags) -> bool:
 def _find_level(problem: Polyhedron, search: Search, level: Pair, ridge: float) -> Pair:
     """Return the level at which the nearest point has the distance rho.
 
-    Also compute its multipliers.
+    The multipliers of this point are computed, too.
 
     The distance is a convex and increasing function of the level. The function is solved piece by
     piece; on each piece, the active constraints are the same. If a solution is outside the interval
@@ -313,12 +314,12 @@ def _defined(problem: Polyhedron, search: Search) -> float:
 def _cagrad_pair(n1: float, n2: float, cosine: float, c: float) -> tuple[float, float, float]:
     """Return three numbers for two gradients with norms 1 = n1 >= n2.
 
-    They are the weight of g_1 in g_w, |g_w|, and |g_0|. Here g_0 is the mean gradient.
+    The three numbers are the weight of g_1 in g_w, |g_w|, and |g_0|. Here g_0 is the mean gradient.
 
     The objective (a - b) x / 2 + c |g_0| sqrt(D (x - x_0)^2 + h^2) is convex in the weight x of
-    g_1. The other symbols are constants. Sums of squares are arranged such that only the cosine
-    itself can cause cancellation. The weight of the longer gradient is returned, because this
-    weight may be very small.
+    g_1. The numbers a, b, D, x_0 and h do not depend on x. Sums of squares are arranged such that
+    only the cosine itself can cause cancellation. The weight of the longer gradient is returned,
+    because this weight may be very small.
     """
     product = n1 * n2
     gap = (n1 - n2) * (n1 - n2)

@@ -22,7 +22,7 @@ class Case:
 
     A head of H elements is followed by R copies of a pattern of Q elements.
 
-    Gramians are sums over elements. They can therefore be computed exactly for any P.
+    Gramians are sums over elements. Gramians can therefore be computed exactly for any P.
 
     Attributes:
         name: Name of the case in the table.
@@ -54,7 +54,7 @@ class Case:
     def exact_head(self) -> Rows:
         """[K, H] values of the head that the operator receives.
 
-        They are rounded, and zero for absent views.
+        The values are rounded, and zero for absent views.
         """
         return self._rounded(self.head)
 
@@ -62,7 +62,7 @@ class Case:
     def exact_pattern(self) -> Rows:
         """[K, Q] values of the pattern that the operator receives.
 
-        They are rounded, and zero for absent views.
+        The values are rounded, and zero for absent views.
         """
         return self._rounded(self.pattern)
 

@@ -139,7 +139,7 @@ def solve(matrix: Matrix, support: Sequence[int], right: Sequence[Number]) -> Ve
 def complementary(matrix: Matrix, offset: Sequence[Number]) -> Vector | None:
     """Return x >= 0 with s = M x + `offset` >= 0 and x.s = 0.
 
-    These are the optimality conditions of a quadratic program.
+    The conditions are the optimality conditions of a quadratic program.
 
     The function uses the active-set method of Lawson and Hanson, and checks the result. In each
     step, the most violated constraint becomes active. If the column of this constraint is a

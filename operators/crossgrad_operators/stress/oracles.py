@@ -163,7 +163,7 @@ class _Combination:
     def length(self) -> Number:
         """The length of the sum.
 
-        It is exactly zero if it is below 1.4e-6 times the longest summand.
+        The length is exactly zero if it is below 1.4e-6 times the longest summand.
         """
         square = dot(self.v, self.products)
         longest = max(abs(x) * n for x, n in zip(self.v, self._norms, strict=True))

@@ -2,7 +2,7 @@
 
 Inside this set, the relative error is at most `PROMISED` u kappa. Here u is the unit roundoff of
 the gradients' type, and kappa = max |w_k| |g_k| / |result|. Outside the set, the result is finite.
-Its length is at most a stated factor times the longest gradient. A test checks that
+The length of the result is at most a stated factor times the longest gradient. A test checks that
 docs/operators.md contains the texts of this file.
 """
 
@@ -72,7 +72,7 @@ class Facts:
     def kappa(self) -> float:
         """Condition number max |w_k| |g_k| / |u|, but at least 1.
 
-        It is 0 if the exact result is zero.
+        If the exact result is zero, the condition number is 0.
         """
         if not self.weights.any():
             return 0.0
@@ -131,7 +131,7 @@ class Facts:
 def default_bound(facts: Facts) -> float:
     """Return 8, or a larger value for many views.
 
-    This value is the rounding error of the weighted sum plus 2 for the weights.
+    The larger value is the rounding error of the weighted sum plus 2 for the weights.
     """
     return max(PROMISED, facts.partial + 2.0)
 

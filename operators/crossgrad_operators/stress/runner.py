@@ -130,7 +130,7 @@ def compared(
 ) -> Finding:
     """Compare a result with its reference.
 
-    `memory` contains the values that the oracle stores. They may change.
+    `memory` contains the values that the oracle stores. The stored values may change in this call.
     """
     expected: Answer | ElementRule | None = reference.rule
     try:

@@ -36,8 +36,8 @@ from crossgrad_operators.stress.oracles import (
 
 #: Number of digits for matrices whose eigenvalues differ by a factor of up to 1e60.
 WIDE: Final = 150
-#: The first iteration runs in float64. It ends at the Newton decrement `ROUGH`, or when an element
-#: of beta reaches `LONG`.
+#: The first iteration runs in float64. The iteration ends at the Newton decrement `ROUGH`, or when
+#: an element of beta reaches `LONG`.
 ROUGH: Final = 1e-3
 LONG: Final = 1e7
 #: If the smallest eigenvalue divided by the largest is above this value, float64 is accurate enough
@@ -50,7 +50,10 @@ LEVELS = 400
 
 
 class UnprovenError(RuntimeError):
-    """The oracle found no point that meets the optimality conditions. Its result is not proven."""
+    """The oracle found no point that meets the optimality conditions.
+
+    The result of the oracle is not proven.
+    """
 
 
 def imtl_g(question: Question) -> Vector:
@@ -90,8 +93,8 @@ def _rank(cosine: Matrix) -> int:
     """Return the number of eigenvalues above 1e-12 times the largest eigenvalue."""
     mp = require_mpmath().mp
     rough = np.linalg.eigvalsh(np.array(cosine, dtype=np.float64))
-    # Eigenvalues in float64 have errors of about 1e-14. This accuracy is enough if all eigenvalues
-    # are far above the limit.
+    # Eigenvalues in float64 have errors of about 1e-14. An error of 1e-14 does not matter if all
+    # eigenvalues are far above the limit.
     if rough.min() > FAR * rough.max():
         return len(cosine)
     values, _ = mp.eigsy(mp.matrix(cosine))
@@ -105,8 +108,8 @@ def _shortest_solution(gramian: Matrix, n: Vector, rank: int) -> Vector:
     v = zeros(count)
     for i in largest:
         terms = [vectors[k, i] * n[k] for k in range(count)]
-        # Skip eigenvectors that are orthogonal to the norms. Their terms would be rounding noise,
-        # divided by an eigenvalue.
+        # Skip eigenvectors that are orthogonal to the norms. The terms of these eigenvectors would
+        # be rounding noise, divided by an eigenvalue.
         if abs(sum(terms)) > number(OPPOSITE) * sum(abs(t) for t in terms):
             factor = sum(terms) / values[i]
             v = [a + factor * vectors[k, i] for k, a in enumerate(v)]
@@ -116,7 +119,7 @@ def _shortest_solution(gramian: Matrix, n: Vector, rank: int) -> Vector:
 def nash(question: Question) -> Vector:
     """Return the weights from the solution of C beta = 1 / beta.
 
-    They are multiplied by the geometric mean of the norms.
+    The weights are multiplied by the geometric mean of the norms.
     """
     mp = require_mpmath().mp
     n, cosine = lengths(question.gramian), cosines(question.gramian)
@@ -260,8 +263,8 @@ def mgda(question: Question) -> Vector:
 def shortest(cosine: Matrix, r: Sequence[Number]) -> Vector:
     """Return the coefficients x >= 0 with r.x = 1 for which sum x_k e_k is shortest.
 
-    Up to a factor, these coefficients minimize |sum x_k e_k|^2 + (r.x - 1)^2. This problem has a
-    solution even if 0 is a convex combination of the directions.
+    Up to a factor, these coefficients minimize |sum x_k e_k|^2 + (r.x - 1)^2. The minimization has
+    a solution even if 0 is a convex combination of the directions.
     """
     size = range(len(r))
     matrix = [[cosine[i][j] + r[i] * r[j] for j in size] for i in size]

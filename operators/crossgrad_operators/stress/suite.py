@@ -20,8 +20,8 @@ from crossgrad_operators.stress.reference import OPTIONS, ORACLES, Views, chaine
 from crossgrad_operators.stress.runner import BLOCK, Cell, Reference, context_of, run_case, timed
 from crossgrad_operators.stress.verdict import ExactCase, Finding, one_sign
 
-#: Function that returns the error of a law in units of u times the largest norm. It returns None if
-#: the law does not apply.
+#: Function that returns the error of a law in units of u times the largest norm. If the law does
+#: not apply, the function returns None.
 Law = Callable[[Operator], float | None]
 _UNIT = 2.0**-24
 #: Number of operators in one part of the table.

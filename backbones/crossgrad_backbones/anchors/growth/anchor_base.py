@@ -126,7 +126,10 @@ class NewAnchors:
         return self.at(ranked[:room].sort().values), left_out
 
     def and_more(self, more: "NewAnchors") -> "NewAnchors":
-        """Append anchors. Both sets must contain the same `further` tensors."""
+        """Append anchors.
+
+        The present and the appended anchors must contain the same `further` tensors.
+        """
         return NewAnchors(
             torch.cat([self.positions, more.positions]),
             torch.cat([self.cells, more.cells]),

@@ -47,9 +47,9 @@ def grown(
 
     The levels are processed in order.
 
-    If the first level adds no anchor, the other levels are skipped. The same rule applies at each
-    level: growth ends if no anchor has been added so far. Anchors that were added at earlier levels
-    occupy their cells, but request no anchors.
+    If the first level adds no anchor, the other levels are skipped. At each later level, growth
+    also ends if no anchor has been added so far. Anchors that were added at earlier levels occupy
+    their cells, but request no anchors.
 
     Args:
         parameters: `anchors` [P, 3], `offsets` [P, k, 3], `features` [P, F], `scales` [P, 6].
@@ -79,7 +79,7 @@ def _at_level(
 ) -> NewAnchors:
     """Return the new anchors of one level.
 
-    Their cells contain none of the `present` anchors [N, 3].
+    The cells of the new anchors contain none of the `present` anchors [N, 3].
     """
     anchor, slot = (eligible & (gradient >= level.threshold)).nonzero().unbind(1)
     kept = torch.from_numpy(rng.random(len(anchor)) < level.keep).to(anchor.device)

@@ -39,7 +39,7 @@ def update(
     beta1, new1, beta2, new2, step_size, root_scale, eps, square_floor, scale = numbers
     for i in range(len(param)):
         g = scale * grad[i]
-        g = min(max(g, -_LARGEST), _LARGEST)  # This order of the arguments preserves NaN.
+        g = min(max(g, -_LARGEST), _LARGEST)  # With this order of arguments, a NaN stays a NaN.
         g = _ZERO if abs(g) < _TINY else g
         m = beta1 * exp_avg[i] + new1 * g
         m = _ZERO if abs(m) < _TINY else m

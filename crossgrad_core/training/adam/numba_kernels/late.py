@@ -50,8 +50,8 @@ NUMBERS = 7
 _ROWS = 1024
 _GATHERED = 128
 #: Number of gradient elements that `update_all` gathers at a time; it is a multiple of the cache
-#: line for rows of any width. These gradients, parameters and moments fit together into the
-#: first-level cache.
+#: line for rows of any width. The gathered gradients fit into the first-level cache together with
+#: their parameters and moments.
 _AT_ONCE = 768
 #: Largest number of consecutive long rows that are updated in one call.
 _SIDE_BY_SIDE = 16

@@ -74,7 +74,7 @@ def largest_jump(
 ) -> tuple[int, float] | None:
     """Return the case whose result changes most if its gradients change by 1e-12.
 
-    Also return this change.
+    The largest change is returned, too.
 
     The change is divided by the length of the longest gradient. Cases in which the operator is not
     continuous are skipped. If all candidates are skipped, the function returns None. The gradients

@@ -70,7 +70,7 @@ def usual(rng: np.random.Generator, blocks: int, views: int, elements: int) -> R
 
 
 def integers(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
-    """Return small integers. They cause exact ties and exactly singular Gramians."""
+    """Return small integers. Small integers cause exact ties and exactly singular Gramians."""
     bounds = rng.choice([1, 2, 9], (blocks, 1, 1))
     return np.rint(bounds * rng.uniform(-1, 1, (blocks, views, elements)))
 
@@ -180,7 +180,7 @@ class Batch:
 def search_views(count: int, seed: int = 0) -> Views:
     """Return views that are alternately near and far.
 
-    Their distances are powers of two, so that products of their powers are exact.
+    The distances of the views are powers of two, so that products of their powers are exact.
     """
     labels = tuple(("near", "far")[k % 2] for k in range(count))
     return Views(labels, tuple(2.0 ** (k % 6 - 2) for k in range(count)), seed)

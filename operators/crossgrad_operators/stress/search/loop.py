@@ -25,8 +25,8 @@ from crossgrad_operators.stress.search.samples import Sample, mutants
 from crossgrad_operators.stress.search.worst_cases import WorstCases, severity, specimen
 from crossgrad_operators.stress.suite import Subject
 
-#: Number of cases in a round whose gradients are changed slightly. These cases need no exact
-#: arithmetic.
+#: Number of cases in a round whose gradients are changed slightly. A case with a slight change
+#: needs no exact arithmetic.
 JUMPS = 64
 #: A simplified case must keep at least this share of the original value.
 KEPT = 0.7
@@ -132,7 +132,8 @@ def shrunk(subject: Subject, specimen: Sample, *, inside: bool) -> Sample:
 
     Args:
         subject: The operator to test.
-        specimen: The case. It has a large error inside the set, or a long result outside the set.
+        specimen: The case. The case has a large error inside the set, or a long result outside the
+            set.
         inside: True if the value of the case is an error inside the set.
     """
     least = KEPT * specimen.value
