@@ -257,7 +257,7 @@ class DistanceConditioned(Vanilla):
 
     @override
     def capped_opacities(self, parameters: Mapping[str, Tensor], cap: float) -> Tensor:
-        """Limit the opacity at the camera distance at which it is largest."""
+        """Limit the opacity at the camera distance for which the opacity is largest."""
         if not self.condition_opacities:
             return super().capped_opacities(parameters, cap)
         most = largest_addition(parameters[SCALE], parameters[OPACITIES.weights].detach())

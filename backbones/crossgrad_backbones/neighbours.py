@@ -14,8 +14,8 @@ def nearest_neighbour_scales(points: NDArray[np.float64]) -> NDArray[np.float64]
         points: [P, 3] points in local units.
 
     Returns:
-        [P] square root of the mean squared distance to the three nearest other points, or to all
-        other points if there are fewer. A lower limit gives duplicate points a size, too.
+        [P] square root of the mean squared distance to the three nearest other points, or to fewer
+        points if the cloud is smaller. A lower limit gives duplicate points a size, too.
     """
     from scipy.spatial import cKDTree
 

@@ -73,8 +73,8 @@ def init_anchors(points: NDArray[np.float64], lattice: Lattice, *, everywhere: b
 
     Initial scales come from the distances between sites of the same level, including sites without
     an anchor. The published code uses distances to anchors of any level. Coarse anchors then start
-    as small as the fine anchors near them. A distant camera uses only coarse anchors, and would
-    show gaps between such small Gaussians.
+    as small as neighbouring fine anchors. A distant camera uses only coarse anchors. With such
+    small Gaussians, its image would show gaps.
 
     Args:
         points: [P, 3] points in local units.

@@ -82,10 +82,11 @@ class Vanilla(Backbone):
 
     @override
     def fitted_to(self, scene: Scene) -> tuple["Vanilla", tuple[str, ...]]:
-        """Leave out spherical harmonics of high degree if there are too few training views.
+        """Leave out spherical harmonics of high degree if the scene has too few training views.
 
         A Gaussian is seen from at most as many directions as there are training views. A higher
-        degree can improve the result only if there are at least as many views as coefficients.
+        degree can improve the result only if the scene has at least as many views as the degree has
+        coefficients.
         """
         if "sh_degree" in self.model_fields_set:
             return self, ()

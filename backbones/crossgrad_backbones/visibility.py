@@ -7,8 +7,8 @@ from torch import Tensor
 
 from crossgrad_core.plugin import Camera
 
-#: A centre counts as seen if it is inside the image plus a margin. The margin on each side is this
-#: share of the image size.
+#: A centre counts as seen if the centre is inside the image plus a margin. The margin on each side
+#: is this share of the image size.
 MARGIN = 0.15
 #: Smallest depth of a centre that a camera sees, in local units. The value equals the default near
 #: plane of the rasterizers.

@@ -2,8 +2,8 @@
 
 The CPU waits for the GPU only when the sum is read.
 
-In contrast, `SummedGradients` checks the gradients of each view as soon as they are added. On a
-GPU, these checks would make the CPU wait K times for each tensor.
+In contrast, `SummedGradients` checks the gradients of each view in `add`. On a GPU, these checks
+would make the CPU wait K times for each tensor.
 """
 
 from collections.abc import Mapping, Sequence
@@ -45,7 +45,7 @@ class DeferredSums(Gradients):
     def add(self, view: Mapping[str, Tensor | None]) -> None:
         """Add the gradients of one more view.
 
-        The caller must not use them any more, because they are overwritten.
+        The caller must not use these gradients any more, because `add` and `total` overwrite them.
 
         Raises:
             RuntimeError: All expected views have already been added.

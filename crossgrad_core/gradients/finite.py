@@ -77,7 +77,7 @@ def _largest_bits(tensors: Sequence[Tensor]) -> list[int]:
     from crossgrad_core.numerics.jobs import parallel, serial
 
     sizes = np.array([tensor.numel() for tensor in tensors], np.int64)
-    # An empty tensor also gets one part, so that `reduceat` returns a number for it.
+    # An empty tensor also gets one part, so that `reduceat` returns a number for each tensor.
     starts = np.array([0, *np.maximum(1, -(-sizes // PART)).cumsum()], np.int64)
     largest_of_parts = np.empty(starts[-1], np.uint32)
     call = parallel if len(largest_of_parts) > _FEW else serial

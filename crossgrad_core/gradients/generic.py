@@ -49,7 +49,7 @@ def combine(
         column: The gradients of K views; None is left out.
         weights: [K] weight of each gradient.
         plain: True to add the gradients without weights, in their own type.
-        out: Tensor for the result; it may be one of the gradients.
+        out: Tensor for the result, which may be one of the gradients.
         divisor: Number by which a plain sum is divided.
     """
     used = [

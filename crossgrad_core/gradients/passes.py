@@ -35,7 +35,7 @@ class Passes(Protocol):
 
 
 def passes_of(*columns: Column) -> Passes:
-    """Return the compiled functions if they support all columns, else the torch functions."""
+    """Return the compiled functions if all columns are supported, else the torch functions."""
     return native if all(map(is_native, columns)) else generic
 
 
@@ -72,7 +72,8 @@ def column_remainders(
 
     Args:
         columns: T columns of gradients.
-        group: [T] index of the Gramian to which each column was added; -1 if it was added to none.
+        group: [T] index of the Gramian to which each column was added; -1 for a column that was not
+            added.
         gramians: [B, K, K] rounded Gramians.
     """
     return rounding_residuals(columns, group, gramians, _scale(columns))
@@ -107,7 +108,8 @@ def rounding_residuals(
 
     Args:
         columns: T columns of gradients.
-        group: [T] index of the Gramian to which each column was added; -1 if it was added to none.
+        group: [T] index of the Gramian to which each column was added; -1 for a column that was not
+            added.
         gramians: [B, K, K] rounded Gramians.
         scale: Factor by which the gradients were multiplied.
     """

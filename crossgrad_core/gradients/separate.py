@@ -39,8 +39,8 @@ class DenseGradients(SeparateGradients):
     """The gradients of K views; each view has its own gradient of each parameter tensor.
 
     Sparse gradients stay sparse for sums and for the Gramians of blocks. All other operations
-    convert them to dense tensors. Gramians are computed in float64. `column_gramians` describes
-    values outside its range.
+    convert sparse gradients to dense tensors. Gramians are computed in float64. `column_gramians`
+    describes values outside its range.
 
     Args:
         views: For each view: tensor name -> gradient. None or a missing name means that the view
@@ -102,8 +102,7 @@ class DenseGradients(SeparateGradients):
     def rounding_residuals(self, granularity: Granularity) -> NDArray[np.float64]:
         if granularity not in self._lost:
             self._require_unspent()
-            # The residual of an infinite or NaN Gramian is replaced by 0, because such a Gramian is
-            # not used.
+            # A Gramian that is infinite or NaN is not used, so its residual is replaced by 0.
             residuals = np.nan_to_num(self._remainders(granularity), posinf=0.0, neginf=0.0)
             self._lost[granularity] = residuals
         return self._lost[granularity]

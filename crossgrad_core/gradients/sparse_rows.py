@@ -28,7 +28,7 @@ def values_of(gradient: Tensor) -> Tensor:
 
 
 def coalesced(gradient: Tensor | None) -> Tensor | None:
-    """Return the gradient. If it is sparse, its rows become sorted and unique."""
+    """Return the gradient. The rows of a sparse gradient become sorted and unique."""
     if gradient is None or not gradient.is_sparse:
         return gradient
     if gradient.sparse_dim() != 1:

@@ -115,7 +115,7 @@ class SummedGradients(Gradients):
     def add(self, view: Mapping[str, Tensor | None]) -> None:
         """Add the gradients of one more view.
 
-        The caller must not use them any more, because they are overwritten.
+        The caller must not use these gradients any more, because `add` and `total` overwrite them.
 
         Raises:
             RuntimeError: All expected views have already been added.

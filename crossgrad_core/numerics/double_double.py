@@ -9,8 +9,7 @@ import numpy as np
 
 from crossgrad_core.numerics.jit import strict_device, strict_part
 
-#: Factor 2^27 + 1, which splits a float64 number into two halves. Products of such halves are
-#: exact.
+#: Factor 2^27 + 1, which splits a float64 number into two halves. Products of two halves are exact.
 _SPLITTER = 134217729.0
 
 

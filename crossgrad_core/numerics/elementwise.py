@@ -1,4 +1,4 @@
-"""Element-wise functions that return the same bits for any number of threads.
+"""Element-wise functions whose results are bit-identical for any number of threads.
 
 torch divides long tensors into parts, one for each thread. In each part, the last elements are
 computed by scalar code, which may round differently from vectorised code. For exp and tanh, scalar
@@ -29,7 +29,7 @@ def sigmoid(values: Tensor) -> Tensor:
 class _Sigmoid(torch.autograd.Function):
     """The sigmoid with its gradient.
 
-    The sigmoid and the gradient have the same bits for any number of threads.
+    The sigmoid and its gradient are bit-identical for any number of threads.
     """
 
     @staticmethod

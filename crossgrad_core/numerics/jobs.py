@@ -13,9 +13,10 @@ can take longer than the computation with one thread. Here, a helper thread that
 not waited for, and idle threads sleep.
 
 Each thread begins with its own range of jobs, and then continues with jobs from the ranges of other
-threads. A thread therefore often reads data that it wrote in the previous kernel. Data from the
-previous kernel are still in the cache of the thread's core. The result of a job must not depend on
-the thread that executes the job. The number of threads then does not change any bit of the results.
+threads. A thread therefore often reads data that the same thread wrote in the previous kernel. Data
+from the previous kernel are still in the cache of the thread's core. The result of a job must not
+depend on the thread that executes the job. The number of threads then does not change any bit of
+the results.
 """
 # ruff: noqa: ANN401, ARG001 - Numba's objects have no types, and Numba defines the arguments.
 
@@ -62,7 +63,7 @@ def next_job(jobs: Jobs, count: int) -> int:
 
     Args:
         jobs: Job counters, passed by `parallel` or `serial`.
-        count: Number of jobs; it must be equal in all calls of a kernel.
+        count: Number of jobs, which must be equal in all calls of a kernel.
     """
     threads = jobs[0]
     mine = jobs.shape[0] - 1 - threads
@@ -81,8 +82,7 @@ def _jobs(threads: int) -> list[Jobs]:
 
     The array contains the number of threads, and how many jobs were taken from each thread's range.
 
-    All arrays share the same memory block. A thread derives its own number from the length of its
-    array.
+    All arrays share one memory block. A thread derives its own number from the length of its array.
     """
     room = np.zeros(2 * threads, np.int64)
     room[0] = threads
@@ -144,7 +144,7 @@ class Begun:
 class _Call:
     """A call for a helper thread.
 
-    The call is skipped if its result is no longer needed when the thread starts it.
+    The call is skipped if its result is no longer needed when a thread starts the call.
 
     A plain lock is used, because a `Future` creates condition variables for each call and each
     wait.
@@ -173,7 +173,10 @@ class _Call:
                 self.error = error
 
     def end(self) -> None:
-        """Wait until the call has finished, or cancel it. Further calls of `end` have no effect."""
+        """Wait until the call has finished; if the call has not begun, cancel it.
+
+        Further calls of `end` have no effect.
+        """
         self._needed = False
         with self._under_way:
             pass
@@ -182,15 +185,15 @@ class _Call:
 class _Helpers:
     """The helper threads of a process. Helper threads use other cores than the calling thread.
 
-    When a thread wakes another thread, Linux first starts the woken thread on the same core. Linux
-    moves the woken thread to an idle core later. The move to an idle core takes longer than most
-    kernels.
+    When a thread wakes another thread, Linux first starts the woken thread on the core of the
+    waking thread. Linux moves the woken thread to an idle core later. The move to an idle core
+    takes longer than most kernels.
     """
 
     def __init__(self) -> None:
         self._threads: list[int] = []
         self._core: int | None = None
-        # Each thread has its own queue, so that repeated kernels use the same cores for the same
+        # Each thread has its own queue, so that a core repeatedly processes the same part of the
         # data.
         self._helpers: list[tuple[SimpleQueue[_Call | None], threading.Thread]] = []
         # If a helper thread were inside a library at interpreter exit, the process would abort.
@@ -232,7 +235,8 @@ class _Helpers:
 def _helpers(process: int) -> _Helpers:
     """Return the helper threads of a process.
 
-    A forked process starts new threads, because it does not inherit them.
+    A forked process starts new threads, because threads of the parent process do not exist in the
+    fork.
     """
     return _Helpers()
 
@@ -240,7 +244,7 @@ def _helpers(process: int) -> _Helpers:
 def serial(kernel: Callable[Concatenate[Jobs, P], None], *args: P.args, **kwargs: P.kwargs) -> None:
     """Run a kernel on this thread only, for small amounts of work.
 
-    The result has the same bits as with `parallel`.
+    The result is bit-identical to the result of `parallel`.
     """
     (jobs,) = _jobs(1)
     kernel(jobs, *args, **kwargs)

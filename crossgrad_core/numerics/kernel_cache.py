@@ -59,8 +59,8 @@ def cache_for(function: Callable[..., Any]) -> Any:  # noqa: ANN401 - Numba's ca
 
     The cache is on disk if a folder is writable; otherwise, nothing is cached.
 
-    The folder is `NUMBA_CACHE_DIR` if this variable is set. Otherwise, it is `__pycache__` next to
-    the kernel's file or the user's cache folder.
+    The folder is `NUMBA_CACHE_DIR` if this variable is set. Otherwise, the folder is `__pycache__`
+    next to the kernel's file, or the user's cache folder.
     """
     try:
         return _DiskCache(function)
@@ -117,7 +117,7 @@ class _DiskCache(cast("Any", FunctionCache)):  # type: ignore[misc]
 
     @override
     def load_overload(self, sig: object, target_context: object) -> object | None:
-        """Return the compiled function, or None if it must be compiled."""
+        """Return the compiled function. Return None if the function must be compiled."""
         compiled = None
         # Ignore any error from a cache file, because the kernel can always be compiled.
         with suppress(Exception):
@@ -206,7 +206,7 @@ class _Files:
     def _drop_older(self) -> None:
         for path in self._folder.glob(f"{self._base}.*"):
             if not path.name.startswith(self._generation) and path.suffix != ".tmp":
-                # Another process may already have deleted the file, or may still have it open.
+                # Another process may already have deleted the file, or may have the file open.
                 with suppress(OSError):
                     path.unlink()
 
@@ -216,9 +216,9 @@ def fingerprint(source: Path) -> str:
     """Return the SHA-256 of all source files that may affect a kernel in `source`.
 
     Numba itself detects changes of the kernel's file, but not of files whose functions are inlined.
-    The hash includes all files of the kernel's folder. The hash also includes all files that they
-    import from their own package or from the core. If an imported file is in a folder of kernels,
-    the files that it imports are included as well.
+    The hash includes all files of the kernel's folder. The hash also includes all files that these
+    kernel files import from their own package or from the core. If an imported file is in a folder
+    of kernels, its imports are included as well.
     """
     digest = hashlib.sha256()
     for path in sorted(_sources(source)):
@@ -241,7 +241,7 @@ def _sources(source: Path) -> set[Path]:
 def _imported(path: Path) -> frozenset[Path]:
     """Return the files that a file imports from its own package or from the core.
 
-    The result is cached, because many kernel files import the same files.
+    The result is cached, because many kernel files import the same modules.
     """
     packages, files = {_CORE, _package_of(path)}, set[Path]()
     for node in ast.walk(ast.parse(path.read_bytes())):

@@ -3,16 +3,16 @@
 Numba relies on LLVM's loop vectoriser. The vectoriser fails for compositing loops, because each
 iteration depends on the previous iteration. The module therefore defines vector types: `Lanes` for
 float32 numbers, and `Mask` for truth values. A kernel that uses these types always compiles to SIMD
-instructions. A vector of eight lanes uses one AVX register. LLVM splits it on machines with
-narrower registers. Functions whose names end in `_wide` create vectors of sixteen lanes. With
+instructions. A vector of eight lanes uses one AVX register. On machines with narrower registers,
+LLVM splits the vector. Functions whose names end in `_wide` create vectors of sixteen lanes. With
 AVX-512, sixteen lanes need half as many instructions. Other machines need two instructions for each
 operation. All other functions accept vectors of eight and of sixteen lanes. Operations are never
-reordered, and `fma` is always fused if the machine supports it. Equal expressions in two kernels
-therefore give equal bits.
+reordered, and `fma` is always fused on machines that support fused operations. Equal expressions in
+two kernels therefore give equal bits.
 
 The functions work only inside compiled kernels. `Lanes` and `Mask` serve as type annotations. A
-kernel that needs further lane operations can define them with `emitted` and the helper functions of
-this module.
+kernel that needs further lane operations can define its own operations with `emitted` and the
+helper functions of this module.
 """
 # ruff: noqa: ANN401, ARG005 - Numba's objects have no types, and Numba defines the arguments.
 
@@ -66,7 +66,8 @@ class _MaskType(types.Type):
         cast("Any", super()).__init__(name=f"Mask{width}")
 
 
-#: Types of vectors, not yet with a number of lanes. Call them with a number of lanes to get a type.
+#: Types of vectors, not yet with a number of lanes. Call `_lanes` or `_mask` with a number of lanes
+#: to get a type.
 _lanes, _mask = _LanesType, _MaskType
 
 
@@ -462,7 +463,7 @@ total: Callable[[Lanes], np.float32] = emitted(_total, types.float32, _eight)
 def aligned(count: int) -> NDArray[np.float32]:
     """Return an array of `count` numbers that is aligned to cache lines.
 
-    No vector in it spans two lines.
+    No vector in the array spans two cache lines.
     """
     room = np.empty(count + WIDE, np.float32)
     shift = (-(room.ctypes.data // room.itemsize)) % WIDE

@@ -15,7 +15,7 @@ def configure_threads(n: int | None = None) -> int:
     """Set the number of threads for Numba's kernels and torch's operators.
 
     Kernels of crossgrad divide their work with `jobs.parallel`. Plugins may use `prange` loops. For
-    these loops, Numba uses OpenMP if it can be loaded, else TBB, else its own "workqueue". The
+    these loops, Numba uses OpenMP if OpenMP can be loaded, else TBB, else its own "workqueue". The
     choice of the threading layer is left to the environment if `NUMBA_THREADING_LAYER` or
     `NUMBA_THREADING_LAYER_PRIORITY` is set. After the first parallel kernel, the threading layer
     cannot change any more. Numba stores the number of threads for each calling thread. Every other

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     import pycolmap
 
 # Camera models that are pinhole cameras if all their distortion parameters are 0. Fisheye models
-# are not listed. With zero parameters, they use an equidistant projection, although pycolmap's
-# `is_undistorted` is True.
+# are not listed. With zero parameters, fisheye models use an equidistant projection, although
+# pycolmap's `is_undistorted` is True.
 _PINHOLE_AT_ZERO = frozenset(
     {"SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION", "DIVISION"}
 )
@@ -120,7 +120,7 @@ class Calibration:
 
     @property
     def without_distortion(self) -> Pinhole:
-        """The pinhole camera with the same focal lengths and principal point."""
+        """The pinhole camera with the focal lengths and the principal point of this calibration."""
         return self._read_pinhole(self._camera)
 
     def resized(self, width: int, height: int) -> "Calibration":
@@ -194,7 +194,8 @@ class Calibration:
     def reached(self) -> NDArray[np.bool_]:
         """Return a mask [H, W] of the pixels of `pinhole`.
 
-        A pixel is True if the photo covers it and its ray is before the fold of the lens model.
+        A pixel is True if the photo covers the pixel, and the ray of the pixel is before the fold
+        of the lens model.
         """
         white = np.full((self.height, self.width), _WHITE, dtype=np.uint8)
         shown: NDArray[np.bool_] = self.undistort(white) == _WHITE
@@ -208,9 +209,9 @@ class Calibration:
     def _options(self) -> "pycolmap.UndistortCameraOptions":
         """The options of pycolmap's undistortion.
 
-        For a very wide lens, no ray below 90 degrees from the axis may hit the border of the photo.
-        pycolmap then shrinks the undistorted photo to the smallest allowed size. In this situation,
-        the options require at least the size of the original photo.
+        For a very wide lens, rays below 90 degrees from the axis may all be inside the photo. The
+        undistorted photo is then shrunk by pycolmap to the smallest allowed size. In this
+        situation, the options require at least the size of the original photo.
         """
         guard_pycolmap()
         import pycolmap

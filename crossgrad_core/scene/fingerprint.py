@@ -202,10 +202,10 @@ class Weight(IntEnum):
     #: The difference concerns only pixels or points. All cameras are unchanged, and the trained
     #: parameters stay valid.
     CONTENT = 1
-    #: The held-out views are not the same as before.
+    #: The set of held-out views has changed.
     HELD_OUT = 2
-    #: The training views are not the same as before, or cameras have moved. The trained parameters
-    #: would be at wrong positions in the new scene.
+    #: The set of training views has changed, or cameras have moved. The trained parameters would be
+    #: at wrong positions in the new scene.
     PLACE = 3
 
 
@@ -225,7 +225,7 @@ class Difference:
 def differences(was: Fingerprint, now: Fingerprint) -> list[Difference]:
     """Return the differences between the former and the current scene.
 
-    The list is empty if they are equal.
+    The list is empty if both scenes are equal.
 
     If the training views change, the local frame and all values in local units change as well. Only
     the change of the views is then reported.

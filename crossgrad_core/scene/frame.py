@@ -18,8 +18,8 @@ _SAME_PLACE = 1e-6
 # A length below this number of input units counts as 0, because its inverse must be finite.
 _SMALLEST = 1e-30
 
-# Local coordinates are rounded to multiples of this number, 1e-9 of the scene extent. If the same
-# scene is given in other units or with another origin, float64 results differ in their last bits.
+# Local coordinates are rounded to multiples of this number, 1e-9 of the scene extent. If a scene is
+# given in other units or with another origin, float64 results differ in their last bits.
 # Differences in the last bits are 1e3 to 1e7 times smaller than the rounding step, so that nearly
 # all rounded coordinates are equal. The rounding step is 60 times smaller than the spacing of
 # float32 numbers near 1.
@@ -33,8 +33,8 @@ class Frame:
     Attributes:
         similarity: Similarity transform from the input frame to the local frame.
         note: A sentence for the log of the run.
-        stray: [N] True for training cameras that were ignored because they are far from all other
-            cameras.
+        stray: [N] True for training cameras that were ignored because of their large distance from
+            all other cameras.
     """
 
     similarity: Similarity
@@ -69,10 +69,10 @@ def camera_centers(world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
 def make_frame(centers: NDArray[np.float64], points: NDArray[np.float64]) -> Frame:
     """Choose the local frame of a scene.
 
-    As in 3DGS, it depends on the centre and extent of the training cameras.
+    As in 3DGS, the frame depends on the centre and extent of the training cameras.
 
     Outlier cameras are ignored. If all training cameras are at one position, the unit is the median
-    distance from the cameras to the points. Without points, it is one input unit.
+    distance from the cameras to the points. Without points, the unit is one input unit.
 
     Args:
         centers: [N, 3] centres of the training cameras in the input frame; N >= 1.

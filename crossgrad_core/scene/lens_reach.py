@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 _FIRST, _CLOSER = (72, 128), (180, 360)
 #: Largest scanned angle from the optical axis. A pinhole camera cannot show 90 degrees or more.
 _WIDEST: Final = np.deg2rad(89.5)
-#: The last pixel before the fold is ignored, because undistortion would spread it over many pixels.
+#: The last pixel before the fold is ignored, because undistortion would spread this pixel over many
+#: pixels.
 _RIM: Final = 1.0
 #: Number of cells along each image side for a sum of areas, and number of rows for which a mask is
 #: computed at a time.
@@ -169,7 +170,7 @@ def _plane(frame: Pinhole, u: NDArray[np.float64], v: NDArray[np.float64]) -> ND
 def _is_inside(pixels: NDArray[np.float64], camera: "pycolmap.Camera") -> NDArray[np.bool_]:
     """Return a mask [...] of pixels [..., 2].
 
-    A pixel is True if it is inside the photo; NaN gives False.
+    A pixel is True if its position is inside the photo; NaN gives False.
     """
     within = (pixels >= 0.0) & (pixels <= [camera.width, camera.height])
     return np.asarray(within.all(axis=-1))

@@ -44,8 +44,8 @@ _MOST_IN_LAS: Final = 20_000_000
 #: motion finds a few hundred points for each photo.
 FEWEST: Final = 100_000
 PER_PHOTO: Final = 1_000
-#: Maximum number of cube sizes that are tried. The search ends early if it keeps at least this
-#: share of the wanted number of points.
+#: Maximum number of cube sizes that are tried. The search ends early if the result contains at
+#: least this share of the wanted number of points.
 _TRIES, _ENOUGH = 12, 0.8
 #: Number of points in the sample from which the size of a cloud is estimated.
 _SAMPLED: Final = 100_000
@@ -66,7 +66,7 @@ class PointCloud:
     Attributes:
         positions: [P, 3] float64.
         colors: [P, 3] uint8.
-        source: Name of the file; empty if there are no points.
+        source: Name of the file; empty without points.
         gaussians: True if the file contains Gaussians. Colours of Gaussians are not read.
     """
 

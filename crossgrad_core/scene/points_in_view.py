@@ -1,4 +1,4 @@
-"""Check that points and cameras are in the same coordinate frame."""
+"""Check that points and cameras are in a common coordinate frame."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace

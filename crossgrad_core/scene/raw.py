@@ -55,7 +55,9 @@ class RawView:
 
 @dataclass(frozen=True, eq=False)
 class RawScene:
-    """A scene as the input describes it. `crossgrad_core.scene.build` converts it to a `Scene`.
+    """A scene as the input describes it.
+
+    `crossgrad_core.scene.build` converts a `RawScene` to a `Scene`.
 
     Attributes:
         root: Folder of the scene. The folder may contain split lists and the default mask folder.

@@ -27,7 +27,7 @@ _FEWEST: Final = 2
 
 @dataclass(frozen=True)
 class Split:
-    """The names of the training views and of the held-out views, and how they were chosen.
+    """The names of the training views and of the held-out views, and the reason for this choice.
 
     Attributes:
         train: Names of the training views, sorted.
@@ -51,10 +51,10 @@ def split_views(
 ) -> Split:
     """Split views as the option `split` requires. At least one view is a training view.
 
-    `auto` first uses list files or the split that the input prescribes. Without such a split,
-    `auto` holds out every n-th photo of each folder. Such a split by folder may hold out fewer than
-    two photos of a regime. If a split by regime would hold out two or more, `auto` holds out every
-    n-th photo of each regime instead.
+    `auto` first uses list files or the split that the input prescribes. A split by folder may hold
+    out fewer than two photos of a regime. Such a split by folder may hold out fewer than two photos
+    of a regime. If a split by regime would hold out two or more, `auto` holds out every n-th photo
+    of each regime instead.
 
     Args:
         names: Names of all views that can be used.
@@ -80,7 +80,7 @@ def split_views(
 
 
 def _by_regime(every: Split, names: Sequence[str], options: SceneOptions, label: Label) -> Split:
-    """Return the split by regime if the option requires it.
+    """Return the split by regime if the option requires it or a regime has too few test views.
 
     The split by regime is also returned if a regime has too few held-out views.
     """
@@ -144,7 +144,7 @@ def _split_by_lists(
     root: Path,
     how: str,
 ) -> Split:
-    # If the input prescribes the split, there are no list files, so the message names the scene's
+    # If the input prescribes the split, no list files exist. The message then names the scene's
     # folder.
     places = [root / file if how == "by lists" else root for file in (TRAIN_LIST, TEST_LIST)]
     both = sorted(listed[0] & listed[1])

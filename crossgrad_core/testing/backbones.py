@@ -67,7 +67,7 @@ def blocks_cover_the_parameters(make: Make[Backbone]) -> None:
 
 
 def the_default_densifier_is_there(make: Make[Backbone]) -> None:
-    """`default_densifier` is installed, and the blocks contain the tensors that it edits."""
+    """The default densifier is installed, and the blocks contain the tensors that it edits."""
     backbone = make()
     densifier = registry.load(Densifier, backbone.default_densifier)
     lacks = densifier.tensors - {name for block in backbone.blocks() for name in block.tensors}
@@ -202,7 +202,7 @@ def checkpoints_give_the_same_gaussians(make: Make[Backbone]) -> None:
 
 
 def edits_keep_rows_together(make: Make[Backbone]) -> None:
-    """After an edit, each row of each per-primitive tensor still belongs to the same primitive."""
+    """After an edit, each row of each per-primitive tensor still belongs to its primitive."""
     backbone = make()
     before = created(backbone)
     rows = primitives_of(backbone.blocks(), before)
@@ -258,7 +258,7 @@ def baking_gives_plain_gaussians(make: Make[Backbone]) -> None:
 
 
 def plain_ones_bake_what_they_draw(make: Make[Backbone]) -> None:
-    """With `plain`, baked and decoded Gaussians give the same image for every camera."""
+    """With `plain`, baked and decoded Gaussians give equal images for every camera."""
     backbone = make()
     if not backbone.plain:
         raise cannot_tell("the backbone does not declare that a standard PLY loses nothing (plain)")

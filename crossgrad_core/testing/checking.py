@@ -25,8 +25,8 @@ class Result:
 
     Attributes:
         check: Name of the check.
-        failure: Reason why the check failed; None if it passed.
-        skipped: Reason why the check does not apply; None if it applies.
+        failure: Reason why the check failed; None for a check that passed.
+        skipped: Reason why the check does not apply; None for a check that applies.
         where: `file:line` of the failure in the plugin. If the line is unknown, the entry point
             that registers the plugin.
     """
@@ -85,7 +85,7 @@ def check_entry(entry: registry.Entry) -> list[Result]:
 def _taken(entry: registry.Entry) -> str:
     """Return the reason why users cannot choose the plugin by its name.
 
-    Return an empty text if they can.
+    The text is empty if users can choose the plugin.
     """
     if entry.slot == COMMANDS and entry.name in OWN_COMMANDS:
         return f"the core has a command {entry.name}, which is called instead"
@@ -97,7 +97,10 @@ def _taken(entry: registry.Entry) -> str:
 
 
 def _announced_at(entry: registry.Entry) -> str:
-    """Return the source location of the object that an entry point names, if it is known."""
+    """Return the source location of the object that an entry point names.
+
+    Without a known location, return the file or the entry point.
+    """
     module, _, name = entry.value.partition(":")
     loaded = sys.modules.get(module.strip())
     thing = getattr(loaded, name.strip(), None)

@@ -17,8 +17,8 @@ from crossgrad_core.registry.commands import Command, as_group_member
 from crossgrad_core.testing.support.contract import cannot_tell, require
 from crossgrad_core.wording import listed
 
-#: Libraries that take long to import. A command must print its first message before it imports one
-#: of these libraries.
+#: Libraries that take long to import. A command must print its first message before the import of
+#: one of these libraries.
 HEAVY: Final = ("matplotlib", "numba", "numpy", "pydantic", "scipy", "torch")
 _IMPORTED = """
 import sys

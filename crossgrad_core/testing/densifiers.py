@@ -183,8 +183,8 @@ def _directions(radii: Tensor, gradient: Tensor, rng: np.random.Generator) -> Te
 def _backbone_for(densifier: Densifier) -> Backbone:
     """Return a backbone for the densifier.
 
-    If possible, it uses this densifier by default; at least, it has the tensors that the densifier
-    edits.
+    If possible, the backbone uses this densifier by default. At least, it has the tensors that the
+    densifier edits.
     """
     fitting = []
     # If several backbones are suitable, the first one is used. Backbones of crossgrad precede the
@@ -273,7 +273,10 @@ def never_outgrows_the_room(make: Make[Densifier]) -> None:
 
 
 def most_primitives_survive(make: Make[Densifier]) -> None:
-    """No edit removes nearly all primitives of a good model. Training could not restore them."""
+    """No edit removes nearly all primitives of a good model.
+
+    Training could not restore nearly all primitives.
+    """
     run = DensifierRun.of(make())
     for step in range(_EDIT - 4, _EDIT + 1):
         before = run.primitives
@@ -297,7 +300,7 @@ def same_seed_same_edits(make: Make[Densifier]) -> None:
 
 
 def resumes_exactly(make: Make[Densifier]) -> None:
-    """A run that was resumed from a checkpoint makes the same edits as an uninterrupted run."""
+    """A resumed run makes the same edits as an uninterrupted run."""
     whole, broken = DensifierRun.of(make()), DensifierRun.of(make())
     for step in _AROUND_EDITS:
         whole.take_step(step)

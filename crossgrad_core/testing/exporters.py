@@ -28,7 +28,7 @@ def has_a_suffix(make: Make[Exporter]) -> None:
 def writes_one_file(make: Make[Exporter]) -> None:
     """Only the named file is written.
 
-    Equal Gaussians give equal bytes, and `write` does not change them.
+    Equal Gaussians give equal bytes, and `write` does not change the Gaussians.
     """
     with TemporaryDirectory() as folder:
         first, second = (Path(folder) / name for name in ("a", "b"))

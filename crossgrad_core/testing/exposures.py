@@ -92,7 +92,10 @@ def projected_values_stay_projected(make: Make[Exposure]) -> None:
 
 
 def a_view_that_was_not_seen_has_values(make: Make[Exposure]) -> None:
-    """Held-out views get finite parameters with the same shapes as training photos."""
+    """Held-out views get finite parameters.
+
+    Their shapes are the shapes of the parameters of training photos.
+    """
     exposure, scene = make(), sample_scene()
     starts = _starts(exposure)
     for view in scene.test_views:

@@ -47,7 +47,7 @@ class NoisePhoto:
 
 @cache
 def sample_scene() -> Scene:
-    """Create a small point cloud with six near and six far cameras around it.
+    """Create a small point cloud that six near and six far cameras surround.
 
     Every fourth view is held out.
 

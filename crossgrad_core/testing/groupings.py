@@ -50,7 +50,10 @@ def fitted(grouping: Grouping, scene: Scene, seed: int = 0) -> GroupingRule:
 
 
 def every_view_has_a_declared_label(make: Make[Grouping]) -> None:
-    """Each view has one label. If `labels` is not empty, it contains this label."""
+    """Each view has one label.
+
+    If `labels` is not empty, `labels` contains the label of each view.
+    """
     grouping, scene = make(), sample_scene()
     rule = fitted(grouping, scene)
     require(isinstance(rule, GroupingRule), f"the result is {rule!r}, not a GroupingRule")

@@ -22,7 +22,7 @@ def adds_points(make: Make[Initializer]) -> None:
     """Each added point has a position, a colour, a size above 0, and an opacity between 0 and 1.
 
     The size and the opacity may also be NaN. An initializer with `alone = True` is also tested on a
-    scene without points. If such an initializer finds no points, it may raise an error.
+    scene without points. If an initializer finds no points, it may raise an error.
     """
     start = make()
     _require_points(start.more_points(sample_scene()))
@@ -52,7 +52,7 @@ def _require_points(more: object) -> None:
 
 
 def answers_alike(make: Make[Initializer]) -> None:
-    """A second call, even on a new object, returns the same points and the same messages."""
+    """A second call, even on a new object, returns equal points and equal messages."""
     scene = sample_scene()
     with global_randomness_untouched():
         one, other = make(), make()

@@ -57,7 +57,7 @@ def nothing_that_counts_is_no_loss(make: Make[Loss]) -> None:
 
 
 def equal_weights_change_nothing(make: Make[Loss]) -> None:
-    """If all pixels have equal weights, the loss is the same as without weights."""
+    """If all pixels have equal weights, the loss equals the loss without weights."""
     loss = make()
     plain = loss.loss(_render(), _photo(), _mask(), None)
     for level in (1.0, 0.25):
@@ -78,7 +78,7 @@ def weights_count(make: Make[Loss]) -> None:
 
 
 def same_input_same_bits(make: Make[Loss]) -> None:
-    """The loss depends only on its arguments, and does not change them."""
+    """The loss depends only on its arguments, and does not change its arguments."""
     render, photo, mask, weights = _render(), _photo(), _mask(), _weights()
     first = make().loss(render, photo, mask, weights)
     require(torch.equal(first, make().loss(render, photo, mask, weights)), "two calls differ")

@@ -66,7 +66,7 @@ def masked_pixels_do_not_count(make: Make[Metric]) -> None:
 
 
 def same_input_same_figure(make: Make[Metric]) -> None:
-    """The metric depends only on the compared images, and does not change them."""
+    """The metric depends only on the compared images, and does not change these images."""
     compared = _compared(_render())
     one, two = make().measure(compared), make().measure(compared)
     require(one == two, f"two measurements of one render return {one} and {two}")

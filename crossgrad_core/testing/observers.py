@@ -208,7 +208,7 @@ def the_model_stays_untouched(make: Make[Observer]) -> None:
 
 
 def _require_new(model: Model, step: int) -> None:
-    """Require that a model is unchanged since `_model` created it."""
+    """Require that a model is still equal to a new model from `_model`."""
     same = _model(step).parameters
     for name, tensor in model.parameters.items():
         equal = torch.equal(tensor.detach(), same[name].detach())
@@ -355,8 +355,8 @@ def _step_hooks(
 ) -> list[Answer]:
     """Call the hooks of a step as in the training loop, and return their results.
 
-    Gradients of single views are available only if the observer declares that it needs them. In the
-    first step, there is no record of a previous step, and views have no labels.
+    Gradients of single views are available only if the observer declares that they are needed. In
+    the first step, no record of a previous step exists, and views have no labels.
     """
     centers, last = sample_scene().centers, _record(step - 1) if step > 1 else None
     sample = SampleContext(
@@ -416,8 +416,8 @@ def nothing_piles_up(make: Make[Observer]) -> None:
             hooks.crossgrad_model_ready(model=model)
             if step % _BLOCK == 0:
                 kept.append(memory())
-    # Ignore the first steps. In them, an observer may allocate memory once and reuse it later, such
-    # as a buffer.
+    # Ignore the first steps. In the first steps, an observer may allocate memory that is reused
+    # later, such as a buffer.
     grown = min(later - earlier for earlier, later in pairwise(kept[1:])) / _BLOCK
     require(
         grown <= _KEPT,

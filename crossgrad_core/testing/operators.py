@@ -37,7 +37,7 @@ _STEPS = 4
 #: A power of two, so that scaling gradients does not cause rounding errors in Gramians.
 _SCALE = 64.0
 _TOLERANCE = 1e-6
-#: Largest relative difference between two results of an iterative solver for the same problem.
+#: Largest relative difference between two results of an iterative solver for one problem.
 _SOLVED = 1e-3
 
 
@@ -262,9 +262,9 @@ def scales_with_the_gradients(make: Make[Operator]) -> None:
 def views_that_are_alike_count_alike(make: Make[Operator]) -> None:
     """The order of the views has no effect: views with equal properties get equal weights.
 
-    The tested gradients all have the same length and the same angle to each other. With more than
-    two views, only right angles are tested. For conflicting gradients, an operator may process
-    pairs one after another.
+    All tested gradients have equal lengths and equal angles to each other. With more than two
+    views, only right angles are tested. For conflicting gradients, an operator may process pairs
+    one after another.
     """
     operator = _matrix_operator(make)
     for views in admitted(operator.views):
@@ -305,7 +305,8 @@ def _alike(case: OperatorCase, gramians: Array) -> OperatorCase:
 def what_it_reads_is_declared(make: Make[Operator]) -> None:
     """`reads_labels` and `reads_gramians` are correct.
 
-    If an operator declares that it does not read an input, this input has no effect.
+    The declarations matter: a run refuses a grouping if no component reads labels, and a
+    granularity if no component reads Gramians.
 
     The declarations matter: a run refuses a grouping if no component reads labels, and a
     granularity if no component reads Gramians.

@@ -157,7 +157,7 @@ def _directions_are_of_pixels(screen: Screen) -> None:
 
 
 def same_input_same_bits(make: Make[Rasterizer]) -> None:
-    """Two renders of the same input and their gradients are bit-identical.
+    """Two renders of one input and their gradients are bit-identical.
 
     The input does not change.
     """
@@ -240,7 +240,7 @@ def rows_on_demand_are_asked_for(make: Make[Rasterizer]) -> None:
 def speed_says_where_it_runs(make: Make[Rasterizer]) -> None:
     """`speed` is 0 for devices that the rasterizer does not support.
 
-    `--rasterizer auto` then never selects it for them.
+    `--rasterizer auto` then never selects the rasterizer for such a device.
     """
     rasterizer = make()
     for device in ("cpu", "cuda"):

@@ -1,4 +1,4 @@
-"""Contract checks for readers: how they treat folders that are not scenes."""
+"""Contract checks for readers, with folders that are not scenes."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory

@@ -44,7 +44,7 @@ def names_settings_that_exist(make: Make[Recipe]) -> None:
 
 
 def decides_the_same_again(make: Make[Recipe]) -> None:
-    """Equal facts give equal rows in the same order."""
+    """Equal facts give equal rows in equal order."""
     with global_randomness_untouched():
         first, second = (make().decide(_facts(3_000)) for _ in range(2))
     require(first == second, "two calls return different rows")

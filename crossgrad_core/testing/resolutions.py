@@ -74,7 +74,7 @@ def same_seed_same_scales(make: Make[Resolution]) -> None:
 
 
 def resumes_exactly(make: Make[Resolution]) -> None:
-    """A run that was resumed from a checkpoint has the same scales as an uninterrupted run."""
+    """A resumed run has the same scales as an uninterrupted run."""
     whole, broken = _Run(make()), _Run(make())
     for number, step in enumerate(_STEPS):
         if number == _BREAK:

@@ -35,7 +35,7 @@ _STEPS, _STOP = 8, 6
 
 
 def trains_soundly(make: Make[Rule]) -> None:
-    """A run with the rule trains finite parameters. A second run gives the same parameters."""
+    """A run with the rule trains finite parameters. A second run gives equal parameters."""
     setup = _setup(make)
     with on_one_thread(), global_randomness_untouched():
         run = train(setup, _STEPS)
@@ -44,7 +44,7 @@ def trains_soundly(make: Make[Rule]) -> None:
 
 
 def goes_on_from_a_checkpoint(make: Make[Rule]) -> None:
-    """A run that was stopped and resumed ends with the same bits as an uninterrupted run."""
+    """A run that was stopped and resumed ends with the bits of an uninterrupted run."""
     setup = _setup(make)
     with on_one_thread():
         state = first_state(setup)

@@ -26,7 +26,7 @@ from crossgrad_core.testing.support.growth import require_bounded, size_of
 #: Numbers of steps before and after an interruption of a run.
 _BEFORE, _AFTER = 7, 12
 #: Number of steps after which every training view must have been drawn. If a sampler draws one of
-#: nine views at random, some view is missing after so many steps with a probability below 9
+#: nine views at random, the probability that some view is missing after so many steps is below 9
 #: (8/9)^400 < 1e-19.
 _PATIENCE = 400
 
@@ -61,7 +61,7 @@ def default_views_are_admitted(make: Make[Sampler]) -> None:
 def draws_are_training_views(make: Make[Sampler]) -> None:
     """Each sample contains K positions of training views.
 
-    If it contains labels, there are K labels.
+    A sample with labels contains K labels.
     """
     sampler = make()
     for views in admitted(sampler.view_counts):
@@ -92,7 +92,10 @@ def _require_good(draw: ViewSample, counts: frozenset[int], available: int) -> N
 
 
 def draws_hand_on_the_groups(make: Make[Sampler]) -> None:
-    """If the training views have groups, every sample contains labels. Operators may need them."""
+    """If the training views have groups, every sample contains labels.
+
+    Operators may need the labels.
+    """
     sampler = make()
     if sampler.default_grouping is not None or sampler.own_labels:
         raise cannot_tell("it chooses its own groups")
@@ -130,7 +133,7 @@ def same_seed_same_draws(make: Make[Sampler]) -> None:
 
 
 def resumes_exactly(make: Make[Sampler]) -> None:
-    """A run that was resumed from a checkpoint draws the same views as an uninterrupted run."""
+    """A resumed run draws the same views as an uninterrupted run."""
     whole, broken = sampler_run(make()), sampler_run(make())
     for _ in range(_BEFORE):
         whole.draw()

@@ -87,8 +87,8 @@ def growth_ahead(setup: Setup, crowd: PrimitiveCounts, schedule: Schedule, step:
     ahead = schedule.edits(step)
     if ahead and setup.numbers.growth == "budget":
         # Some primitive budgets exceed the number of primitives that a run reaches, for example in
-        # runs of about the published length. Without this limit, the cost of such runs would be
-        # overestimated.
+        # runs of about the published length. Without this limit, the cost of runs with such a large
+        # budget would be overestimated.
         return min(1.0 + COST_PER_EDIT * COUNTED_EDITS, _along_curve(setup, crowd, schedule, step))
     done = schedule.edits_before + schedule.edits() - ahead
     return 1.0 + COST_PER_EDIT * min(ahead, max(0, COUNTED_EDITS - done))
@@ -181,7 +181,7 @@ def most_steps(setup: Setup) -> int:
 def _probed(setup: Setup, state: TrainState, seconds: float) -> tuple[int, float]:
     """Return the number of measured steps, and the training time per view in seconds.
 
-    The measurement repeats the same `PROBE_STEPS` steps, because later steps may render more
+    The measurement always repeats the same `PROBE_STEPS` steps, because later steps may render more
     pixels.
 
     If a kernel is compiled, the measurement restarts. The number of restarts is limited, because a
@@ -222,7 +222,9 @@ class Length(Protocol):
 
 
 class Planned:
-    """A length from a record: fixed, or revised at the same steps as in an earlier run.
+    """A length from a record.
+
+    It is fixed, or revised at the steps at which an earlier run revised it.
 
     Args:
         revisions: Pairs of a step and the total number of steps that is valid after this step.
@@ -271,7 +273,10 @@ class Timed:
         return steps >= PROBE_STEPS and seconds >= LOOK_SHARE * self._seconds
 
     def revised(self, setup: Setup, state: TrainState) -> Setup:
-        """Return the setup with the number of steps that now fits. The configuration records it."""
+        """Return the setup with the number of steps that now fits.
+
+        The configuration records this number.
+        """
         # Measure the cost per view, because the number of views per step may change.
         seconds = state.clock.trained(self._kind) - self._clock
         newest = seconds / views_of(setup, setup.schedule, self._step, state.step)

@@ -45,9 +45,9 @@ class Stopper:
     """A request to stop a run, together with its reason.
 
     Attributes:
-        signal: Number of the first signal; None if there was no signal.
+        signal: Number of the first signal; None before the first signal.
         at_once: True after a second signal. Optional work, such as the evaluation, is then skipped.
-        error: Error from outside the training step that ends the run; None if there is no error.
+        error: Error from outside the training step that ends the run; None without an error.
     """
 
     signal: int | None = None
@@ -125,7 +125,7 @@ _VIEWS, _STEPS = 8, 2
 
 
 class Prefetcher:
-    """A prefetcher of photos: it predicts the next views and lets threads decode their photos.
+    """A prefetcher of photos. It predicts the next views, and threads decode their photos.
 
     The prefetcher draws the next views with copies of the sampler's random generator and state. The
     prediction only decides which photos are decoded first. The prediction may be wrong if the
@@ -230,8 +230,8 @@ def train(
 ) -> Ending:
     """Run the remaining steps of the schedule, or stop when `pauses` returns True after a step.
 
-    If the caller passes the same `guard` again after a pause, training can return to a state before
-    the pause. By default, each call creates a new guard.
+    If the caller passes an earlier `guard` after a pause, training can return to a state before the
+    pause. By default, each call creates a new guard.
 
     Raises:
         TrainingFailedError: A value is NaN or infinite, either at the start or again after a
@@ -355,7 +355,7 @@ def looks_after(setup: Setup, step: int) -> bool:
 
 
 def copies_after(setup: Setup, step: int) -> bool:
-    """Return True if the state after this step is copied, so that a rollback can restore it."""
+    """Return True if the state after this step is copied for a later rollback."""
     return step % SNAPSHOT_EVERY == 0 or saves_after(setup, step)
 
 

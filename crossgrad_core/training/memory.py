@@ -40,10 +40,13 @@ def peak_mebibytes(device: torch.device) -> float | None:
 
 
 def available_bytes(device: torch.device) -> int | None:
-    """Return the bytes that can still be allocated; None if the system does not report them."""
+    """Return the bytes that can still be allocated.
+
+    Return None if the system does not report this number.
+    """
     if device.type == "cuda":
-        # Memory that torch has reserved does not count as free on the GPU, but torch can use it for
-        # new tensors.
+        # On the GPU, memory that torch has reserved does not count as free. Torch can still use
+        # this memory for new tensors.
         kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
         return torch.cuda.mem_get_info(device)[0] + kept
     figures = [
@@ -81,7 +84,7 @@ class Demand:
         views: Number of views K in the step.
         separate: True if the gradients of the views are stored separately.
         watched: True if the combined gradient must not overwrite the gradient of a view.
-        joint: True if the graphs of all views exist at the same time.
+        joint: True if the autograd graphs of all views exist in parallel.
         copies: Number of copies of the parameters in the states of rules.
     """
 
@@ -95,7 +98,7 @@ class Demand:
 
     @property
     def gradients(self) -> int:
-        """Number of gradients that exist at the same time.
+        """Number of gradients that exist in parallel.
 
         With separate gradients, one for each view; otherwise, the sum and the newest gradient.
         """

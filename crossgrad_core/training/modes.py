@@ -24,7 +24,7 @@ def mode_note(name: str, grouping: Grouping, scene: Scene) -> tuple[str, ...]:
         return ()
     measured = bimodality(quantity.values[np.isfinite(quantity.values)])
     figure = measured.deciding
-    # The coefficient is NaN if all values are equal or there are too few values.
+    # The coefficient is NaN if all values are equal or the number of values is too small.
     if not figure < ONE_MODE:
         return ()
     return (

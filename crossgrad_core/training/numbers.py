@@ -33,7 +33,7 @@ class Numbers:
         """Return the settings of a configuration.
 
         Raises:
-            UserError: A setting has no value, because neither the user nor a recipe set it.
+            UserError: A setting has no value, because neither the user nor a recipe set a value.
         """
         values = {field.name: getattr(config, field.name) for field in fields(cls)}
         if missing := [name for name, value in values.items() if value is None]:

@@ -1,7 +1,6 @@
 """Exposure parameters for each photo: stored like the state of a plugin, with an Adam of their own.
 
-Because they are stored like the state of a plugin, snapshots, rollback and checkpoints include
-them.
+Snapshots, rollback and checkpoints include all plugin states, and therefore also these parameters.
 """
 
 import json
@@ -61,8 +60,8 @@ def read_values(path: Path, like: Mapping[str, Tensor]) -> dict[str, dict[str, T
 
     Args:
         path: The file.
-        like: Name -> [P, ...] parameters of the present run. The file must contain the same names
-            and shapes.
+        like: Name -> [P, ...] parameters of the present run. The file must contain equal names and
+            shapes.
 
     Raises:
         UserError: The file cannot be read, or contains the parameters of another exposure model.
@@ -203,7 +202,7 @@ def check_photos_are(setup: Setup, state: TrainState) -> None:
 
 
 def write_photos(setup: Setup, state: TrainState, path: Path) -> bool:
-    """Write the parameters of all training photos, if there are any.
+    """Write the parameters of all training photos. Without such parameters, write no file.
 
     Return True if a file was written.
     """
@@ -253,8 +252,8 @@ def take_photo_step(
         return
     held = state.states[STATE]
     tensors = {name: tensor.clone() for name, tensor in held.tensors.items()}
-    # Keep the step counts on the CPU. Loading a checkpoint may have moved them to the GPU, where
-    # reading a count in each step would wait for the GPU.
+    # Keep the step counts on the CPU. After a checkpoint is loaded, the counts may be on the GPU.
+    # Reading a count in each step would then wait for the GPU.
     tensors[_COUNT] = tensors[_COUNT].cpu()
     rates = {name: parameter.lr.at(progress) for name, parameter in setup.per_photo.items()}
     for row, gradients in _summed(taken).items():

@@ -42,7 +42,7 @@ class ScaledPhotos:
     def get(self, view: View, camera: Camera, full: Callable[[View], Pair]) -> Pair:
         """Return the photo and the mask of a view in the camera's size.
 
-        The cache shares them, so do not change them.
+        The cache shares both tensors, so do not change them.
 
         Args:
             view: The view.
@@ -86,7 +86,7 @@ class DevicePhotos:
     def get(self, view: View, camera: Camera, full: Callable[[View], Pair]) -> Pair:
         """Return the photo and the mask of a view on the GPU, in the camera's size.
 
-        `full` returns them in host memory and full size.
+        `full` returns photo and mask in host memory and full size.
         """
         size = camera.width, camera.height
         held = self._kept.get(view.name)
@@ -131,7 +131,7 @@ def _bytes(made: dict[_Size, Pair]) -> int:
 
 
 def reduced(image: Tensor, mask: Tensor | None, width: int, height: int) -> Pair:
-    """Return image and mask reduced by area. Each new pixel is the mean of the area that it covers.
+    """Return image and mask reduced by area. Each new pixel is the mean of an area of the image.
 
     Masked pixels are left out of the means. A new pixel is valid if at least half of its area is
     valid. A single thread computes all sums in a fixed order, so that the result is repeatable.
@@ -158,8 +158,8 @@ def decoded_meanwhile(scene: Scene) -> Iterator[None]:
 
     Held-out photos are decoded first.
 
-    Decoded photos stay in the photo cache if they fit. A photo that cannot be decoded is skipped
-    here. The next access to the photo raises the error.
+    Decoded photos stay in the photo cache if the cache is large enough. A photo that cannot be
+    decoded is skipped here. The next access to the photo raises the error.
     """
     over = Event()
     thread = Thread(target=_decode, args=(scene, over), name="crossgrad-photos", daemon=True)

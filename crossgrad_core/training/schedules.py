@@ -36,7 +36,8 @@ def schedule_of(
     )
     schedule = densifier.window(Schedule.for_run(steps, config.schedule, counting))
     edits = _given(config, _EDITS)
-    # The schedule may be longer than the run if it is not scaled to the length of the run.
+    # The schedule may be longer than the run, unless the schedule is scaled to the length of the
+    # run.
     length = min(schedule.length, schedule.counted(schedule.total))
     schedule = replace(
         schedule,
@@ -45,7 +46,7 @@ def schedule_of(
         sh_wait=round(numbers.sh_start * length),
         **edits,
     )
-    # If the user set the times of edits, `min_refinements` must not change them.
+    # If the user set the times of edits, `min_refinements` must not change these times.
     return replace(schedule, min_refinements=0) if edits else schedule
 
 

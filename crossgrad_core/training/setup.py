@@ -39,7 +39,7 @@ def learns_in(step: int, every: int) -> bool:
     """Return True if a tensor that is updated once in `every` steps is updated in this step.
 
     A hash function chooses one step of each `every` steps. With a fixed interval, a sampler that
-    cycles through photos or regimes could always skip some of them.
+    cycles through photos or regimes could always skip some photos or regimes.
     """
     turn, offset = divmod(step - 1, every)
     return offset == hash32(turn) * every >> 32
@@ -197,7 +197,8 @@ class Setup:
 
         Args:
             steps: Total number of steps of the run.
-            start: Number of primitives at the start; None before they are counted.
+            start: Number of primitives at the start; None if the primitives have not been counted
+                yet.
         """
         rows = self.decide(Length(self.config.steps or steps, steps, start))
         return {row.setting: row.value for row in rows if row.setting in FOLLOWING}

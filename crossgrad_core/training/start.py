@@ -57,9 +57,9 @@ def compiling_beside(setup: Setup) -> Iterator[None]:
     """Compile kernels in a second process, which starts when the first missing kernel is found.
 
     No second process is used on a GPU, on a single core, or if the run uses only one thread. At the
-    end of the block, this process waits for the second process. Then it loads all kernels for
-    sparse rows. Steps with few and with many rows use different kernels, and the second kind may
-    first occur during training.
+    end of the block, this process waits for the second process. Then this process loads all kernels
+    for sparse rows. Steps with few and with many rows use different kernels, and the second kind
+    may first occur during training.
     """
     alone = setup.config.threads == 1 or available_cores() == 1
     processes: list[subprocess.Popen[bytes]] = []
@@ -75,7 +75,8 @@ def compiling_beside(setup: Setup) -> Iterator[None]:
         with notes_on_missing(start):
             yield
         for process in processes:
-            # A process that hangs, for example while it imports a plugin, must not block the run.
+            # A process that hangs, for example during the import of a plugin, must not block the
+            # run.
             with suppress(subprocess.TimeoutExpired):
                 process.wait(_PATIENCE)
         if setup.sparse_rows:
@@ -87,7 +88,10 @@ def compiling_beside(setup: Setup) -> Iterator[None]:
 
 
 def compile_all(loss: ComponentChoice) -> None:
-    """Compile the kernels of a loss and of the optimizer by calling them with artificial data."""
+    """Compile the kernels of a loss and of the optimizer.
+
+    For this, they are called with artificial data.
+    """
     photo = torch.zeros((64, 64, 3), dtype=torch.uint8)
     render = torch.full((64, 64, 3), 0.5, requires_grad=True)
     measured = build(Loss, loss.name, loss.options).loss(render, photo, None, None)
@@ -99,7 +103,10 @@ def compile_all(loss: ComponentChoice) -> None:
 
 
 def compile_rows() -> None:
-    """Compile the optimizer kernels for sparse rows by calling them with artificial data."""
+    """Compile the optimizer kernels for sparse rows.
+
+    For this, they are called with artificial data.
+    """
     values, state, late = torch.zeros((8, 3)), AdamState(), Late()
     # The three steps call all kernels: one row, another row with deferred steps, and enough rows
     # for the kernel that updates all rows.
@@ -135,8 +142,8 @@ def first_state(setup: Setup) -> TrainState:
     parameters = ordered(parameters, setup.blocks, setup.backbone.positions)
     trained = {name for block in setup.trained_blocks for name in block.tensors}
     parameters = {
-        # Make the tensors contiguous, as they are after a checkpoint is loaded. Another memory
-        # layout would change the rounding.
+        # Make the tensors contiguous, because they are contiguous after a checkpoint is loaded.
+        # Another memory layout would change the rounding.
         name: tensor.detach().to(setup.device).contiguous().requires_grad_(name in trained)
         for name, tensor in parameters.items()
     }
@@ -157,8 +164,9 @@ def initial_parameters(setup: Setup, rng: np.random.Generator) -> tuple[Paramete
 
     If the points would give more primitives than the user's limit, a random subset of the points is
     used. The run then starts with the share `BEGINNING` of the limit. Density control can add the
-    remaining primitives in regions that need them. Without density control, the run starts with as
-    many primitives as the limit allows. The Gaussians of a PLY file are used unchanged.
+    remaining primitives in regions that need more primitives. Without density control, the run
+    starts with as many primitives as the limit allows. The Gaussians of a PLY file are used
+    unchanged.
 
     Returns:
         The parameters, and the number of primitives that all points would give. The number is None
@@ -232,7 +240,7 @@ def _misfit(begun: Scene, known_count: int) -> str:
 
 
 def _made(setup: Setup, answer: object, method: str) -> Parameters:
-    """Check the parameters that a method of the backbone returned, and return them.
+    """Check and return the parameters that a method of the backbone returned.
 
     Raises:
         UserError: The result is not a dictionary, or tensors are missing. After `prepare`, all
@@ -261,7 +269,7 @@ def thinned(scene: Scene, share: float, rng: np.random.Generator) -> Scene:
     At least one point remains.
 
     Points that have sizes were added by an initializer. All points of the initializer are kept if
-    they fit, because each of them covers a region without other points.
+    they fit, because each point covers a region without other points.
     """
     count = len(scene.points)
     wanted = max(1, round(share * count))
@@ -317,12 +325,12 @@ def unwatched(setup: Setup) -> Setup:
 def warm_up(setup: Setup, reached: TrainState | None = None) -> float:
     """Compile all kernels that the run needs, by taking steps with temporary states.
 
-    Photos are decoded at the same time. Decoding at the same time saves time, because compilers run
-    one at a time and release the interpreter lock.
+    Photos are decoded in parallel. Parallel decoding saves time, because compilers run one at a
+    time and release the interpreter lock.
 
     Args:
         setup: Setup of the run.
-        reached: The training state of a resumed run; it is not changed.
+        reached: The training state of a resumed run; this state does not change.
 
     Returns:
         The time that the compilation took, in seconds.

@@ -152,10 +152,10 @@ class TrainState:
     """All values that a training step reads and changes.
 
     Attributes:
-        tensors: The parameters as they are in memory. Some rows may have deferred Adam steps, and
+        tensors: The parameters as present in memory. Some rows may have deferred Adam steps, and
             other threads may still be changing rows.
-        moments: The optimizer's moments as they are in memory. Deferred steps and running steps
-            also change the moments.
+        moments: The optimizer's moments as present in memory. Deferred steps and running steps also
+            change the moments.
         rngs: Name of a random stream -> its generator.
         states: Name of a plugin -> its state.
         step: Number of steps, including the present step.
@@ -225,7 +225,7 @@ class TrainState:
         self.states.update(states)
 
     def accept(self, states: Mapping[str, PluginState], hook: HookCaller) -> None:
-        """Check the states that plugins returned from a hook, and store them.
+        """Check and store the states that plugins returned from a hook.
 
         Args:
             states: State of each plugin, by the name of the plugin.
@@ -264,7 +264,9 @@ class TrainState:
 
 
 def unsavable(new: PluginState, device: str, known: PluginState = EMPTY_STATE) -> str:
-    """Return why a checkpoint cannot store a state; empty if it can.
+    """Return why a checkpoint cannot store a state.
+
+    The text is empty if a checkpoint can store the state.
 
     To keep steps fast, only names that the state `known` does not contain are checked.
     """
@@ -280,7 +282,10 @@ def unsavable(new: PluginState, device: str, known: PluginState = EMPTY_STATE) -
 
 
 def no_json(value: object) -> str:
-    """Return the part of a value that JSON cannot store unchanged; empty if JSON can store it."""
+    """Return the part of a value that JSON cannot store unchanged.
+
+    The text is empty if JSON can store the value.
+    """
     if isinstance(value, dict):
         odd = (f"the key {key!r}" for key in value if not isinstance(key, str))
         return next(odd, "") or no_json(list(value.values()))
@@ -291,7 +296,10 @@ def no_json(value: object) -> str:
 
 
 def _odd(value: object, device: str) -> str:
-    """Return why a value cannot be stored as a tensor in a file; empty if it can."""
+    """Return why a value cannot be stored as a tensor in a file.
+
+    The text is empty if it can be stored.
+    """
     if not isinstance(value, Tensor):
         return f"of type {type(value).__name__}, not a tensor"
     plain = value.layout == torch.strided and not value.dtype.is_complex and not value.is_quantized
@@ -346,7 +354,7 @@ class _Current(Mapping[str, Tensor]):
 class StepSnapshot:
     """A snapshot of all values that a step changes, except parameters and moments.
 
-    Plugin states and records are immutable, so that they need no copy.
+    Plugin states and records are immutable, so they are not copied.
     """
 
     step: int
@@ -401,7 +409,7 @@ class Snapshot:
     def restore(self, state: TrainState, seed: int) -> None:
         """Restore `state`, but with new random streams.
 
-        Training then does not repeat the same draws.
+        After the rollback, training therefore makes other draws than before.
         """
         state.late.forget()
         state.tensors = self._tensors(state, {n: t.clone() for n, t in self.parameters.items()})
@@ -519,9 +527,9 @@ class RollbackGuard:
     """Protection against errors: values before the present step, and a copy of an earlier state.
 
     Most errors of a step occur before parameters change, for example in sampling, photo decoding or
-    rendering. After such an error, only the present step is lost. If an error interrupts the
-    optimizer or an edit, the copy of the earlier state is restored. Only states that are finite are
-    copied.
+    rendering. After an error of this kind, only the present step is lost. If an error interrupts
+    the optimizer or an edit, the copy of the earlier state is restored. Only states that are finite
+    are copied.
 
     Args:
         state: The training state at the start, which must already be checked.
@@ -534,7 +542,7 @@ class RollbackGuard:
         state.touched = False
 
     def commit(self, state: TrainState, *, look: bool = False) -> None:
-        """Record that a step is complete, so that it is not lost after an error in the next step.
+        """Record that a step is complete. An error in the next step then does not undo this step.
 
         Raises:
             NonFiniteError: `look` is True, and a parameter is NaN or infinite.
@@ -545,7 +553,7 @@ class RollbackGuard:
         state.touched = False
 
     def check(self, state: TrainState) -> None:
-        """Check the parameters, unless they have already been checked after this step.
+        """Check the parameters, unless a check after this step has already been done.
 
         Raises:
             NonFiniteError: A parameter is NaN or infinite.
@@ -588,7 +596,7 @@ class RollbackGuard:
 def is_whole(state: TrainState) -> bool:
     """Return True if all parameters are finite.
 
-    Return False if they are not or cannot be checked.
+    Return False if a parameter is not finite or the check fails.
     """
     try:
         return are_parameters_finite(state)

@@ -96,7 +96,7 @@ _LABELS = "labels"
 def regroup_if_due(setup: Setup, state: TrainState) -> None:
     """Group the training views again if the last completed step is the grouping's `refit_after`.
 
-    The state of the sampler is reset, because it refers to the old groups of views.
+    The state of the sampler is reset, because this state refers to the old groups of views.
     """
     grouping = setup.selection.grouping
     if not isinstance(grouping, Regrouping) or state.step != grouping.refit_after:
@@ -141,8 +141,8 @@ def observed_views(
         NonFiniteError: The loss of the extra view is not finite.
     """
     if setup.config.densify_views == "one":
-        # In each step, use another position of the sample. A sampler may always put the same group
-        # first.
+        # In each step, use another position of the sample. A sampler may always put one group of
+        # views first.
         return (records[state.step % len(records)],)
     wanted = setup.schedule.grows and setup.schedule.collects(state.step)
     if setup.config.densify_views != "extra" or not wanted:
@@ -248,7 +248,7 @@ def final_edits(setup: Setup, state: TrainState) -> Iterator[FinalEdit]:
 
     Values that the backbone derives are not updated.
 
-    If an error interrupts an edit, the state stays as it was before this edit.
+    If an error interrupts an edit, the state before this edit is kept.
 
     Raises:
         UserError: An edit does not match the parameters.
@@ -453,7 +453,10 @@ def _aggregate(setup: Setup, state: TrainState, context: AggregateContext) -> Ag
 
 
 def _misfit(answer: AggregateResult, wanted: Mapping[str, Tensor]) -> str:
-    """Return why a result does not match the trained tensors; empty if it does."""
+    """Return why a result does not match the trained tensors.
+
+    The text is empty for a matching result.
+    """
     for mapping in (answer.gradients, answer.counts):
         if not isinstance(mapping, Mapping):
             return f"{type(mapping).__name__}, not a mapping of names"

@@ -68,9 +68,9 @@ def _copied(pixels: Tensor) -> Tensor:
     """Return a contiguous copy of the pixels."""
     if not pixels.is_cpu:
         return pixels.contiguous()
-    # Torch would use a second thread for the copy, and would wait for it if all cores are busy.
-    # Copy each channel separately, because NumPy is slow if the inner dimension has only three
-    # elements.
+    # Torch would copy with a second thread. If all cores are busy, torch would wait for this
+    # thread. Copy each channel separately, because NumPy is slow if the inner dimension has only
+    # three elements.
     copy = torch.empty(pixels.shape, dtype=pixels.dtype)
     for channel in range(pixels.shape[2]):
         np.copyto(copy.numpy()[:, :, channel], pixels.numpy()[:, :, channel])
@@ -78,11 +78,11 @@ def _copied(pixels: Tensor) -> Tensor:
 
 
 def as_in_full(gaussians: Gaussians, rasterizer: Rasterizer, stride: int) -> Gaussians:
-    """Return the Gaussians with the dilation that they have in the full-size image.
+    """Return the Gaussians with the dilation of the full-size image.
 
     A pixel of the strided image is n times wider, which changes the unit of the dilation.
 
-    A render of these Gaussians with `camera_of` equals the full render at the same pixels.
+    A render of these Gaussians with `camera_of` equals the full render at the rendered pixels.
     Exceptions are Gaussians far outside the image, whose positions are clamped.
     """
     if stride == 1:

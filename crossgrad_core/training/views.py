@@ -209,7 +209,7 @@ def add_regularization(
 ) -> None:
     """Add the gradients of regularization terms to `into`.
 
-    The terms belong to `view` or, if it is None, to the whole step.
+    The terms belong to `view`. If `view` is None, they belong to the whole step.
     """
     context = RegularizeContext(
         **context_fields(setup, state, "regularize"),
@@ -361,7 +361,7 @@ def render_views(
     state.counters.backward_passes += len(records)
     if not setup.separate:
         return Rendered(with_losses, regular, tuple(photos)), total
-    # The operator may overwrite the separate gradients, unless a plugin reads them later.
+    # The operator may overwrite the separate gradients, unless a plugin reads the gradients later.
     apart = DenseGradients(per_view, setup.trained_blocks, overwrite=not setup.watchers)
     return Rendered(with_losses, regular, tuple(photos)), apart
 
@@ -466,7 +466,7 @@ def _render_jointly(
 ) -> tuple[Rendered, Gradients]:
     """Run one backward pass through the sum of all losses.
 
-    The autograd graphs of all views exist at the same time.
+    The autograd graphs of all views exist in parallel.
     """
     _clear(state.tensors)
     drawn = [_draw_view(setup, state, draw, slot, scale) for slot, scale in enumerate(scales)]

@@ -49,7 +49,7 @@ def remember(
 
 
 def _known(kept: torch.Tensor | None, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return a copy of the stored values, or zeros if they are missing."""
+    """Return a copy of the stored values. Return zeros if no values are stored."""
     if kept is None or tuple(kept.shape) != shape:
         return np.zeros(shape)
     stored: NDArray[np.float64] = kept.cpu().numpy().astype(np.float64)

@@ -17,7 +17,7 @@ _THRESHOLDS: Final = {"v2": 0.9, "low": 0.6}
 
 
 class ConfGate(GramianOperator):
-    """Project a pair of views only if it conflicts now and has probably conflicted for some time.
+    """Project a pair of views only if it conflicts now and has probably done so for some time.
 
     The mean mu and variance v of the cosine of a pair are bias-corrected exponential averages. The
     averages correspond to n_eff = (1 + beta) / (1 - beta) samples. The probability of a conflict is

@@ -46,7 +46,7 @@ class PCGrad(GramianOperator):
 
     For each view i, v starts as g_i. For all j != i in random order, if v.g_j < 0, v -= (v.g_j /
     |g_j|^2) g_j with the original g_j. The result u is the sum of all v. In a step, all blocks use
-    the same random order. With two views, no random number is drawn.
+    one random order. With two views, no random number is drawn.
 
     Source: Yu et al. 2020, "Gradient surgery for multi-task learning", algorithm 1.
     """
@@ -69,9 +69,9 @@ class Soft(GramianOperator):
     """Remove `strength` times the component along g_j from g_i if cos(g_i, g_j) < -`threshold`.
 
     For the present vector v of view i, v -= strength (v.g_j / |g_j|^2) g_j. With threshold 0 and
-    strength 1, the result equals `symmetric`; with strength 0, it equals `sum`. With a threshold
-    above 0, the result is not continuous in the gradients. Pairs are processed in the order of the
-    views in the step.
+    strength 1, the result equals the operator `symmetric`. With strength 0, it equals `sum`. With a
+    threshold above 0, the result is not continuous in the gradients. Pairs are processed in the
+    order of the views in the step.
     """
 
     identity_at_one: ClassVar[bool] = True

@@ -19,7 +19,7 @@ class Sum(MatrixOperator):
     """The sum of the gradients, equal to a backward pass through the sum of the losses.
 
     The operator needs neither Gramians nor separate gradients. If separate gradients are available,
-    their sum has the same bits as accumulated gradients.
+    their sum is bit-identical to accumulated gradients.
     """
 
     separate: ClassVar[bool] = False

@@ -142,12 +142,12 @@ class AnchorBackbone(AnchorOptions):
 
     A subclass decides where the initial anchors are, and which anchors a camera uses.
 
-    Blocks: anchors [P, 3] (frozen); offsets [P, k, 3] in units of exp(scales[:, :3]); features [P,
-    F]; scales [P, 6] (logarithms: three for the offsets, three for the size of Gaussians);
-    mlp_opacity, mlp_cov, mlp_color and, if enabled, mlp_bank (four tensors each); voxel_size
-    (frozen). The published code also stores a rotation and an opacity for each anchor, but never
-    trains them. Rotations and opacities of anchors are left out here. Source: Scaffold-GS (Lu et
-    al. 2024).
+    Blocks: `anchors` [P, 3], frozen; `offsets` [P, k, 3] in units of exp(scales[:, :3]); `features`
+    [P, F]; `scales` [P, 6], logarithms of three scales of the offsets and three sizes of Gaussians;
+    `mlp_opacity`, `mlp_cov`, `mlp_color` and, if enabled, `mlp_bank`, with four tensors each;
+    `voxel_size`, frozen. The published code also stores a rotation and an opacity for each anchor,
+    but never trains these two tensors. Rotations and opacities of anchors are left out here.
+    Source: Scaffold-GS (Lu et al. 2024).
     """
 
     positions: ClassVar[str] = "anchors"

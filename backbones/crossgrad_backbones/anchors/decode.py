@@ -188,9 +188,9 @@ def gaussians_of(view: View, *tensors: Tensor) -> Gaussians:
 
     Args:
         view: The constant inputs.
-        tensors: float32 tensors: features [Q, F], offsets [P, k, 3], log scales [P, 6], then weight
-            and bias of the first layers, and of the second layers of opacity, covariance and
-            colour.
+        tensors: Features [Q, F], offsets [P, k, 3], log scales [P, 6], then weights and biases, all
+            float32. The weights and biases belong to the first layers, and to the second layers of
+            opacity, covariance and colour.
     """
     result = _Decode.apply(view, *tensors)  # type: ignore[no-untyped-call]
     return Gaussians(**dict(zip(_OUTPUTS, result, strict=True)))

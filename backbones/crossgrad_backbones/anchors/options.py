@@ -157,7 +157,8 @@ def code_of(codes: Tensor, poses: Tensor, camera: Camera, *, training: bool) -> 
     Args:
         codes: [V, C] codes of the training views.
         poses: [V, 3, 4] world-to-camera poses of the training views.
-        camera: The camera. Training views with equal poses share the code of the first of them.
+        camera: The camera. If several training views have the pose of the camera, the first of
+            these views is used.
         training: True if the view is used for training.
     """
     if training:

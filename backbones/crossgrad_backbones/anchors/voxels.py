@@ -22,8 +22,8 @@ def automatic_voxel_size(points: NDArray[np.float64]) -> float:
     """Return twice the median distance from a point to its nearest neighbour, in local units.
 
     Scaffold-GS instead takes the median of the mean *squared* distance to three neighbours as a
-    length. The median of squared distances depends on the unit of the input, so it is not used
-    here.
+    length. The median of squared distances depends on the unit of the input, so this length is not
+    used here.
 
     Args:
         points: [N, 3] points in local units.

@@ -25,8 +25,8 @@ def root_cell(edge: float, base_layer: int, wanted: float) -> float:
 
     Args:
         edge: Edge of the cube in local units.
-        base_layer: Number of times the cube is halved. With -1, it is halved until cells have about
-            the edge `wanted`.
+        base_layer: Number of times the cube is halved. With -1, the cube is halved until cells have
+            about the edge `wanted`.
         wanted: Wanted edge in local units. If the cube has no size, `wanted` is the result.
     """
     if edge <= 0.0:
@@ -166,7 +166,7 @@ class Lattice:
         `shares` contains the share of cameras that use each anchor's level.
 
         An anchor whose level all cameras use is never pruned. Without this rule, a threshold equal
-        to the mean share would remove all anchors if all cameras have the same distance.
+        to the mean share would remove all anchors if all cameras have equal distances.
         """
         return (shares > self.visible_share) | (shares >= 1.0)
 
@@ -177,7 +177,7 @@ def distance_range(
     """Return a robust largest and smallest distance between cameras and points (Octree-GS).
 
     For each camera, the quantiles 1 - `ratio` and `ratio` of its distances to all points are
-    computed. The results are the same two quantiles of all these values.
+    computed. The results are the quantiles 1 - `ratio` and `ratio` of all these values.
 
     Args:
         points: [P, 3] points, P >= 1.

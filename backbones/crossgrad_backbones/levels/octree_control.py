@@ -89,8 +89,8 @@ def grown(
     """Return new anchors in the requested cells that are empty.
 
     The feature vector of a new anchor is the elementwise maximum over requesting anchors of the
-    same level. Without such anchors, it is 0. New anchors whose level too few cameras use are left
-    out.
+    same level. Without such anchors, the feature vector is 0. New anchors whose level too few
+    cameras use are left out.
 
     Args:
         parameters: The parameters of an octree backbone, detached from autograd.
@@ -163,8 +163,8 @@ class OctreeControl(AnchorDensifier):
       the results.
     - Anchors are also added on a level that is still empty. In the published code, an empty level
       stays empty.
-    - If anchors of two levels request the same cell in one edit, the feature vectors come from the
-      level of the cell.
+    - If anchors of two levels request one cell in an edit, the feature vectors come from the level
+      of the cell.
 
     As in the published code, the next level and the extra levels are used from the first edit on.
     The authors of the paper probably intended to wait for the end of the coarse phase.

@@ -211,8 +211,8 @@ def spread_gramian(
                 if addresses[k] != 0:
                     places[k] = dense.ctypes.data + 4 * k * CHUNK
             _chunk_gramian(places, 0, length, compact, partial[c])
-            # Numba frees an array after the last line that names it. The assignment keeps `dense`
-            # alive while its address is used.
+            # Numba frees an array after the last line that names the array. The assignment keeps
+            # `dense` alive while its address is used.
             dense[0] = np.float32(0.0)
         c = next_job(jobs, chunks)
 
@@ -314,7 +314,7 @@ def _combine_pieces(
     first: int,
     end: int,
 ) -> None:
-    """Compute the results in a small buffer, because they may overwrite the gradient of a view."""
+    """Compute the results in a small buffer, because they may overwrite a view's gradient."""
     wide = np.empty(PIECE)
     narrow = np.empty(PIECE, np.float32)
     for start in range(first, end, PIECE):
@@ -346,8 +346,8 @@ def _combine_chunk(
         for i in range(result.size):
             result[i] = 0.0
     elif count == 2 and (out == rows[0] or out == rows[1]):
-        # The most common situation: there are two views, and the result overwrites the gradient of
-        # one view. The order of two summands does not change the sum.
+        # The most common situation: two views, and the result overwrites the gradient of one view.
+        # The order of two summands does not change the sum.
         this = 0 if out == rows[0] else 1
         a, b = row(out, first, end - first), row(rows[1 - this], first, end - first)
         if plain:

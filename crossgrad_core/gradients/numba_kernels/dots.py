@@ -1,8 +1,8 @@
 """Dot products of a few float32 rows in float64; each row is read only once.
 
-The compiler may reorder sums within a call, so that it can use vector registers. Products of
-float32 numbers are exact in float64. Squares of all float32 magnitudes, from 1e-90 to 1e77, neither
-underflow nor overflow.
+Within a call, the compiler may reorder sums to use vector registers. Products of float32 numbers
+are exact in float64. Squares of all float32 magnitudes, from 1e-90 to 1e77, neither underflow nor
+overflow.
 """
 
 import numpy as np

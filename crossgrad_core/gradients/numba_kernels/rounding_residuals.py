@@ -1,4 +1,4 @@
-"""Gramians with twice as many digits as float64, for operators that need them.
+"""Gramians with twice as many digits as float64, for operators that need more digits.
 
 Products are added one at a time. The rounding errors of products and sums are added separately
 (Ogita, Rump and Oishi 2005). The results are as exact as with 106-bit arithmetic. Sums of this kind

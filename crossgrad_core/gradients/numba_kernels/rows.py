@@ -1,6 +1,7 @@
 """Gramians and weighted sums for each row: every primitive has its own small Gramian.
 
-Addresses have the same meaning as in `dense`. Row i of a tensor of width d starts at element i * d.
+`addresses` and `sizes` have the meaning that `dense` describes. Row i of a tensor of width d starts
+at element i * d.
 """
 
 import numpy as np
@@ -80,7 +81,7 @@ def row_combine(jobs: Jobs, addresses: Ints, weights: Floats, out: int, width: i
         jobs: Job counters, passed by `parallel`.
         addresses: [K] addresses of the gradients; 0 leaves a view out.
         weights: [N, K] weight of each row of each view.
-        out: Address of the result; it may be the address of a view's gradient.
+        out: Address of the result, which may be the address of a view's gradient.
         width: Number of elements in a row.
     """
     count = weights.shape[0]

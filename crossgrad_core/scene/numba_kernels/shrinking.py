@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import strict_device, strict_kernel
 
-#: Number of columns that are filtered at a time, so that they fit into the cache of a core.
+#: Number of columns that are filtered at a time; so many columns fit into the cache of a core.
 _BLOCK = 1024
 
 
@@ -134,7 +134,9 @@ def shrink(
     along_rows: NDArray[np.float64],
     small: NDArray[np.uint8],
 ) -> None:
-    """Resize `image` to the size of `small`, which must not be larger, and write it to `small`.
+    """Resize `image` to the size of `small`, and write the result to `small`.
+
+    Neither side may become larger.
 
     Args:
         image: [H, W C] image, contiguous.

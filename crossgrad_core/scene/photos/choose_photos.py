@@ -47,7 +47,7 @@ _AT_ONCE: Final = 8
 
 
 def white_of(deep: Sequence[Path]) -> tuple[int, list[str]]:
-    """Return the value of white in all 16-bit photos, and a note if it is not 65535.
+    """Return the value of white in all 16-bit photos. Return a note if this value is not 65535.
 
     All photos share this value, which depends on the brightest pixel in all photos. Photos stay
     dark if their largest value matches neither the 16-bit range nor a smaller range.
@@ -229,7 +229,7 @@ def _prefer_reduced(
 
 
 def _fit(calibration: Calibration, header: PhotoHeader, path: Path) -> tuple[int, int, int]:
-    """Return width, height and EXIF orientation of a photo, such that the size matches its camera.
+    """Return width, height and EXIF orientation of a photo in the orientation of its camera.
 
     COLMAP ignores the EXIF orientation. The stored orientation is therefore used, unless only the
     rotated photo has the aspect ratio of the camera.
@@ -251,7 +251,7 @@ def _fit(calibration: Calibration, header: PhotoHeader, path: Path) -> tuple[int
 
 
 def _limit(width: int, height: int, max_size: int | None) -> tuple[int, int]:
-    """Return a size whose longest side is within the limit, with the same aspect ratio."""
+    """Return a size whose longest side is within the limit. The aspect ratio does not change."""
     longest = max(width, height)
     if max_size is None or longest <= max_size:
         return width, height

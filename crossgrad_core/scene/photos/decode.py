@@ -23,10 +23,11 @@ RESIZE_FILTER = "scikit-image resize, anti-aliased"
 _FULL_8_BIT, FULL_16_BIT = 255, 65535
 #: Values of white in files with 1, 8, 10, 12, 14 or 16 bits.
 WHITES = (1, _FULL_8_BIT, 1023, 4095, 16383, FULL_16_BIT)
-#: Largest share of grey pixels in a black-and-white mask. A pixel is grey if it differs from black
-#: and from white by more than a tenth of the range.
+#: Largest share of grey pixels in a black-and-white mask. A pixel is grey if its difference from
+#: black and its difference from white exceed a tenth of the range.
 _MOST_GREY = 0.05
-#: Number of bytes of a photo that are copied at a time, so that they stay in the processor's cache.
+#: Number of bytes of a photo that are copied at a time; so many bytes stay in the processor's
+#: cache.
 _BAND = 1 << 19
 #: SciPy truncates its Gaussian filter at this number of standard deviations.
 _WIDTHS = 4.0
@@ -68,8 +69,8 @@ def decode_mask(path: Path) -> Pixels:
     """Decode a mask [H, W]: 255 for pixels that are at least half white (valid pixels), else 0.
 
     White is the largest value of the smallest bit depth that can contain all values of the mask: 1,
-    255, 1023, 4095, 16383 or 65535. The alpha channel is used as the mask if it varies and the
-    colours are not black and white.
+    255, 1023, 4095, 16383 or 65535. If the alpha channel varies and the colours are not black and
+    white, the alpha channel is the mask.
 
     Raises:
         UserError: The mask is damaged, or its kind is not supported.
@@ -206,7 +207,8 @@ def _read_grey(image: "Image") -> NDArray[np.int32]:
 def _read_mask(image: "Image") -> NDArray[np.int32]:
     """Read a mask [H, W] from the grey values of an image.
 
-    Use alpha instead if it varies and the colours are not black and white.
+    If the image has an alpha channel that varies, and its colours are not black and white, alpha is
+    used instead.
     """
     if image.mode.startswith("I") or not pillow.has_alpha(image):
         return _read_grey(image)

@@ -46,7 +46,7 @@ _ARRAYS: Final = frozenset({".npy", ".npz"})
 
 @dataclass(frozen=True)
 class Pairs:
-    """Names, and the files that match them.
+    """Names, and the files that match these names.
 
     Attributes:
         files: Name -> the only file that matches the name.
@@ -58,12 +58,12 @@ class Pairs:
 
 
 class FileNames:
-    """Files below a folder, which can be found by the names that other programs use for them.
+    """Files below a folder. They can be found by the names that other programs use for them.
 
-    A name matches the file with exactly the same path. If there is no such file, the name matches
-    the file with the same base name and the most similar path. Suffix, letter case and Unicode form
-    may differ. A file in another folder matches only if the folder in the name does not exist. If
-    this folder exists but does not contain the file, the name has no file.
+    A name matches the file with exactly the same path. Without such a file, the name matches the
+    file with the same base name and the most similar path. Suffix, letter case and Unicode form may
+    differ. A file in another folder matches only if the folder in the name does not exist. If this
+    folder exists but does not contain the file, the name has no file.
 
     Args:
         names: Paths of the files below the folder, with forward slashes.
@@ -179,7 +179,10 @@ def same_spelling(name: str, other: str) -> bool:
 
 
 def without_suffix(name: str) -> str:
-    """Return a name without its image suffix. A name without such a suffix is unchanged."""
+    """Return a name without its image suffix.
+
+    Without an image suffix, the name is returned unchanged.
+    """
     stem, suffix = os.path.splitext(name)
     return stem if suffix.lower() in IMAGES else name
 

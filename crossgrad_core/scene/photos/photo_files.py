@@ -158,7 +158,7 @@ def find_mask_folder(option: Path | None, root: Path) -> Path | None:
     """Return the mask folder.
 
     The mask folder is the folder of the option, as a path or relative to the scene. Without the
-    option, it is `<scene>/masks`, if this folder exists.
+    option, the mask folder is `<scene>/masks`, if this folder exists.
 
     Raises:
         UserError: The folder that the option names does not exist.
@@ -199,7 +199,7 @@ def check_masks(folder: Path, option: Path | None, found: int, names: Sequence[s
 
 
 def _default_folders(root: Path) -> Iterator[Path]:
-    """Yield `<scene>/masks`, and folders whose name differs from it only in letter case."""
+    """Yield `<scene>/masks`, and folders whose name differs from `masks` only in letter case."""
     if (root / _DEFAULT).is_dir():
         yield root / _DEFAULT
     alike = (path for path in sorted(root.iterdir()) if path.name.casefold() == _DEFAULT)

@@ -1,4 +1,4 @@
-"""Write notes on the photos of a scene and how they are processed, and on unused files."""
+"""Write notes on the photos of a scene, the processing of photos, and unused files."""
 
 import os
 from collections import Counter, defaultdict

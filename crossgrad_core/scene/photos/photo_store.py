@@ -113,7 +113,7 @@ class PhotoStore:
     def decoded(self, source: Storable) -> Decoded:
         """Return the photo from its entry if the entry is valid.
 
-        Otherwise, decode the photo and store it.
+        Otherwise, decode the photo and store the decoded photo.
 
         Raises:
             UserError: The photo is damaged.
@@ -184,7 +184,7 @@ class PhotoStore:
         for last_used, length, path in entries:
             if used + size <= self._limit or last_used >= self._begun:
                 break
-            # Another process may already have deleted the file, or may still have it open.
+            # Another process may already have deleted the file, or may have the file open.
             with suppress(OSError):
                 path.unlink()
                 used -= length

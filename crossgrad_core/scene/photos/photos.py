@@ -1,4 +1,4 @@
-"""Photos that are decoded when they are requested, and the memory cache for decoded photos."""
+"""Photos that are decoded on demand, and the memory cache for decoded photos."""
 
 import os
 from collections import OrderedDict
@@ -28,8 +28,8 @@ from crossgrad_core.scene.photos.decode import (
 from crossgrad_core.scene.photos.photo_store import Decoded, PhotoStore, Storable, made_by
 from crossgrad_core.scene.photos.shapes import is_turned
 
-#: To test a JPEG file, it is decoded at an eighth of its width and height. Decoding at an eighth of
-#: the size is faster, but still reads all data of the file.
+#: To test a JPEG file, decode the file at an eighth of its width and height. Decoding at an eighth
+#: of the size is faster, but still reads all data of the file.
 SMALLEST = 8
 _OPAQUE, _HALF = 255, 128
 #: Seconds that a thread waits for a photo while another thread decodes the photo.
@@ -59,7 +59,7 @@ class PhotoSource:
             for a pinhole camera.
         target: Width and height of the training photo.
         reduction: Number by which the file's width and height are divided during decoding.
-        white: Value of white in the file, if it has 16 bits per channel.
+        white: Value of white in a file with 16 bits per channel.
     """
 
     path: Path
@@ -190,12 +190,12 @@ class PhotoCache(Generic[Key]):
     Training uses all photos again and again, in changing order. If the photos need slightly more
     memory than the limit, a least-recently-used cache would almost never contain the next photo.
     Here, old photos stay in memory. A new photo replaces one of the latest few photos, if possible
-    one that is not expected next. If the photos need twice as much memory as the limit, about half
-    of the requests find their photo in memory.
+    a photo that is not expected next. If the photos need twice as much memory as the limit, about
+    half of the requests find their photo in memory.
 
     Args:
         mib: Memory for decoded photos and masks, in MiB. The latest photo is always stored, even if
-            it exceeds this limit.
+            the photo exceeds this limit.
         store: Disk cache of the photos; None to use no disk cache.
     """
 
@@ -255,7 +255,7 @@ class PhotoCache(Generic[Key]):
                 over.set()
 
     def prepare(self, source: Key) -> bool:
-        """Write the photo to the disk cache, if it is not there yet.
+        """Write the photo to the disk cache, unless the cache already contains the photo.
 
         Return False if this photo is never cached on disk.
         """

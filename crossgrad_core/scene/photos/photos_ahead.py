@@ -15,7 +15,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.scene.photos.photos import FilePhoto
 from crossgrad_core.scene.wording import name_some
 
-#: Number of photos that are decoded at the same time. A larger number would need more memory.
+#: Number of photos that are decoded in parallel. A larger number would need more memory.
 AT_ONCE = 2
 #: Seconds that the end of a run waits for photos that are still being decoded.
 _PATIENCE = 5.0
@@ -27,7 +27,7 @@ class PhotosAhead:
     """Background threads that decode the photos of the next steps, and all other photos once.
 
     With enough cores, training never waits for a photo. A damaged photo is found early, before a
-    step uses it. The order of decoding does not affect the results of a run.
+    step needs the photo. The order of decoding does not affect the results of a run.
     """
 
     def __init__(self) -> None:
@@ -72,7 +72,7 @@ class PhotosAhead:
         return self._at_work
 
     def expect(self, views: Sequence[View]) -> None:
-        """Announce the next views in the order in which steps use them.
+        """Announce the next views, in the order in which steps use these views.
 
         The new list of views replaces all earlier announcements.
         """
@@ -82,7 +82,8 @@ class PhotosAhead:
         cache, size, fitting = photos[0].cache, 0, list[FilePhoto]()
         for photo in photos:
             size += photo.source.decoded_bytes
-            # Leave out further photos, because they would remove earlier photos from the cache.
+            # Leave out further photos, because further photos would remove earlier photos from the
+            # cache.
             if size <= cache.limit // 2:
                 fitting.append(photo)
         cache.expect(photo.source for photo in fitting)
@@ -136,7 +137,7 @@ class PhotosAhead:
 def decode(view: View, *, keep: bool) -> None:
     """Decode a view's photo into memory.
 
-    Without `keep`, decode it into the disk cache, or only test it.
+    Without `keep`, decode the photo into the disk cache, or only test the photo.
 
     Raises:
         UserError: The photo cannot be decoded.
@@ -180,10 +181,10 @@ def check_photos(views: Sequence[View], *, keep: bool, whole: bool = False) -> N
 
     Args:
         views: The views whose photos are checked.
-        keep: True if there is enough memory to keep the decoded photos.
-        whole: True to decode all photos completely, even without memory to keep them. If both
-            `whole` and `keep` are False, files are only tested; JPEG files are decoded at an eighth
-            of their size.
+        keep: True if the memory suffices to keep the decoded photos.
+        whole: True to decode all photos completely, even if the decoded photos cannot be kept in
+            memory. If both `whole` and `keep` are False, files are only tested; JPEG files are
+            decoded at an eighth of their size.
 
     Raises:
         UserError: Some photos cannot be decoded. The message names the photos.

@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 #: Largest number of pixels of a photo. The limit is Pillow's default limit, and an RGB photo of
 #: this size needs 0.5 GB.
 MOST_PIXELS: Final = 178_956_970
-# Formats that cameras and mask tools write. Pillow supports more formats, but some of them start
-# external programs.
+# Formats that cameras and mask tools write. Pillow supports more formats, but some of these formats
+# start external programs.
 _FORMATS = ("AVIF", "BMP", "GIF", "JPEG", "JPEG2000", "MPO", "PNG", "PPM", "TIFF", "WEBP")
 _LOCK = Lock()
 _DEEP = re.compile("RGBA?;16[BLN]")
 #: Suffixes of HEIC and HEIF files.
 SUFFIXES = (".heic", ".heif", ".hif")
-#: Number of bytes at the start of a file that show whether it is a HEIC or HEIF file.
+#: Number of bytes at the start of a file that identify HEIC and HEIF files.
 HEAD = 12
 _BRANDS = frozenset(
     {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"hevm", b"hevs", b"mif1", b"msf1"}
@@ -42,7 +42,9 @@ _BRANDS = frozenset(
 
 @contextmanager
 def opened(path: Path, what: str) -> Iterator["Image"]:
-    """Open a photo without decoding it. All errors inside the block are raised as `UserError`.
+    """Open a photo, but do not decode the photo.
+
+    All errors inside the block are raised as `UserError`.
 
     Args:
         path: Path of the photo.

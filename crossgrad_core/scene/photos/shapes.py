@@ -30,7 +30,7 @@ def is_scaled(size: Size, of: Size) -> bool:
 def is_turned(size: Size, photo: Size) -> bool | None:
     """Return True if a mask matches its photo only after a quarter turn.
 
-    Return None if it does not match at all.
+    Return None if the mask does not match in any orientation.
     """
     turned = photo[::-1]
     if size in {photo, turned}:
@@ -68,8 +68,8 @@ def choose_reduction(path: Path, header: PhotoHeader, max_size: int | None) -> i
     """Choose the number by which both sides of a photo are divided during decoding: 1, 2, 4 or 8.
 
     The number is 1 for all photos that are small enough to be decoded completely. For larger
-    photos, it is the largest number that leaves at least `max_size` pixels on the longest side. If
-    no number leaves so many pixels, the smallest possible number is used.
+    photos, the number is the largest one that leaves at least `max_size` pixels on the longest
+    side. If no number leaves so many pixels, the smallest possible number is used.
 
     Raises:
         UserError: The photo is too large. The message suggests a remedy.

@@ -159,7 +159,9 @@ _BYTES_OF_A_PIXEL: Final = 4
 
 
 def checked(scene: Scene, path: Path, *, cache_mib: int, accept: bool = False) -> Scene:
-    """Check a scene. Return it with notes about contradictions and with the results in `check`.
+    """Check a scene.
+
+    The returned scene contains notes about contradictions, and the results in `check`.
 
     Args:
         scene: The scene.

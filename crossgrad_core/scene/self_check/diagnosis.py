@@ -26,7 +26,7 @@ _FEWEST_UNTRACKED: Final = 3 * FEWEST
 #: A later trial replaces an earlier, simpler trial only if its score is higher by more than this
 #: number.
 _CLEARLY: Final = 0.03
-#: A small change counts as an improvement if it raises the score by more than this number.
+#: A small change counts as an improvement if the score increases by more than this number.
 _PROBED: Final = 0.01
 #: Number of times that a search halves its step.
 _ROUNDS: Final = 4
@@ -94,7 +94,7 @@ class Diagnosis:
 def scores(agreement: Agreement, *, tracked: bool) -> Floats:
     """Return a score [V] in [0, 1] for each camera: the colour correlation.
 
-    With tracks, it is multiplied by the share of points inside the photo.
+    With tracks, the correlation is multiplied by the share of points inside the photo.
     """
     correlation = np.maximum(np.nan_to_num(agreement.correlation), 0.0)
     if tracked:
@@ -248,7 +248,7 @@ def searches() -> Iterator[Search]:
 def probes() -> Iterator[Trial]:
     """Yield small changes of the numeric camera parameters.
 
-    In a correct scene, none of them raises the score.
+    In a correct scene, no small change raises the score.
     """
     for make in (_focal, _scaled):
         yield from (make(value) for value in (0.93, 1.07))

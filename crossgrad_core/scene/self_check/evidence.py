@@ -27,8 +27,7 @@ MOST_OBSERVED: Final = 64
 MOST_TRIED: Final = 2_000
 #: Minimum number of points that are tested in each photo if the views have no tracks.
 _TESTED: Final = 1_500
-#: A point is hidden if another point in the same cell of the image is nearer by at least this
-#: factor.
+#: A point is hidden if another point in its image cell is nearer by at least this factor.
 _HIDES: Final = 1.15
 #: `_IN_A_CELL`: number of points in a cell of the depth test. `_CELLS`: largest number of cells in
 #: each direction.
@@ -90,7 +89,7 @@ class Rig:
     def chosen(self, views: Sequence[int] | Integers) -> "Rig":
         """Return a rig that contains only some of the cameras.
 
-        Each camera is still compared with the same photo.
+        Each camera keeps the photo with which it is compared.
         """
         rows = np.asarray(views, dtype=np.int64)
         return replace(
@@ -106,7 +105,7 @@ class Rig:
     def joined(self, others: Sequence["Rig"]) -> "Rig":
         """Return a rig with the cameras of this rig and of other rigs.
 
-        All rigs must have the same points.
+        All rigs must contain equal points.
         """
         rigs = (self, *others)
         return replace(
@@ -312,7 +311,7 @@ def tested(scene: Scene, views: Integers, pixels: Pixels, most: int) -> Evidence
 
 
 def _unhidden(shares: Floats, depth: Floats, inside: Booleans) -> Booleans:
-    """Return a mask [V, N] of the points that no nearer point in the same image cell hides."""
+    """Return a mask [V, N] of the points that no nearer point in their image cell hides."""
     cameras = len(depth)
     cells = np.clip(np.sqrt(inside.sum(axis=1) / _IN_A_CELL), 1, _CELLS).astype(np.int64)
     across, down = (

@@ -91,7 +91,7 @@ class Verdict:
         correlation: Median colour correlation of all photos; NaN if no colours could be compared.
         in_frame: Median share of the observed points that are inside their photos; NaN without
             tracks.
-        all_wrong: Why the scene as a whole is contradictory; None if it is not.
+        all_wrong: Why the scene as a whole is contradictory; None for a consistent scene.
         some_wrong: Why single photos disagree.
         notes: Other results for the user.
     """
@@ -140,8 +140,8 @@ def verdict_of(scene: Scene, views: Sequence[int], pixels: Pixels) -> Verdict:
         )
     has_tracks = np.array([len(scene.views[view].seen) >= FEWEST for view in views])
     rows = np.asarray(views, dtype=np.int64)
-    # If some photos have tracks, leave out the photos without tracks. Hidden points in those photos
-    # would give wrong results.
+    # If some photos have tracks, leave out the photos without tracks. Hidden points in photos
+    # without tracks would give wrong results.
     if has_tracks.any():
         rows = rows[has_tracks]
         return _Group.of(observed(scene, rows, pixels), rows).verdict()
@@ -150,14 +150,14 @@ def verdict_of(scene: Scene, views: Sequence[int], pixels: Pixels) -> Verdict:
 
 @dataclass(frozen=True, eq=False)
 class _Group:
-    """A group of photos. Either all or none of them have tracks.
+    """A group of photos. Either all photos of a group have tracks, or no photo has tracks.
 
     Attributes:
         evidence: The cameras, points and photos to compare.
         views: [V] numbers of the views in the scene.
         agreement: How well the photos agree with the points without any change.
         recolored: True if the colours of the points contain no information. Colours from other
-            photos then replace them.
+            photos then replace the colours of the points.
     """
 
     evidence: Evidence
@@ -171,7 +171,7 @@ class _Group:
         return group.by_photos() if evidence.tracked and not evidence.colored else group
 
     def by_photos(self) -> "_Group":
-        """Return the same photos, but with colours of the points from other photos."""
+        """Return this group of photos, but with colours of the points from other photos."""
         evidence = self.evidence.of_photos()
         return _Group(evidence, self.views, evidence.agreement(evidence.rig), recolored=True)
 
@@ -202,7 +202,7 @@ class _Group:
     def bad(self) -> Booleans:
         """[V] True for photos that disagree.
 
-        The correlation of such a photo is low, and its colours deviate too much.
+        A photo disagrees if its correlation is low and its colours deviate too much.
         """
         correlation, noise = self.agreement.correlation, self.agreement.noise
         low = np.nan_to_num(correlation, nan=1.0) < _BAD * self.better
@@ -253,7 +253,7 @@ class _Group:
     def _of_all(self, rows: Integers) -> Cause | None:
         """Find a change of all cameras that improves photos which agree only in part.
 
-        Return None without such a change.
+        If no change improves these photos, return None.
         """
         bench = Bench(self.evidence, rows)
         if bench.before < _SURE:
@@ -288,7 +288,7 @@ class _Group:
         return self._unexplained(verdict)
 
     def _unexplained(self, verdict: Verdict) -> Verdict:
-        """Return the verdict if most photos disagree and no trial repairs them."""
+        """Return the verdict if most photos disagree and no trial makes them agree."""
         if self.better >= LEAST:
             return replace(verdict, some_wrong=self.suspects())
         unrelated = Cause(tuple(self.views.tolist()), *_UNRELATED)
@@ -383,7 +383,7 @@ class _Group:
             evidence = self.evidence.chosen(np.full(len(others), row))
             agreement = evidence.agreement(replace(evidence.rig, photos=others))
             fit = scores(agreement, tracked=self.evidence.tracked)
-            # If few points are inside a photo, it may fit by chance, because many photos are tried.
+            # A photo with few points inside may fit by chance, because many photos are tried.
             fit[(others == self.views[row]) | (agreement.inside < _FEWEST_TESTED)] = 0.0
             if self._fits(fit.max(keepdims=True), np.array([row]))[0]:
                 fitting.append(row)

@@ -1,4 +1,4 @@
-"""Contract checks for operators in a training step, where they combine the gradients of K views."""
+"""Contract checks for operators in a training step, where they combine K gradients."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -83,7 +83,7 @@ def aggregate_context(
 def _summed(gradients: Sequence[Mapping[str, Tensor | None]]) -> SummedGradients:
     total = SummedGradients.empty(BLOCKS, len(gradients))
     for view in gradients:
-        # The sum owns the tensors that it receives, and modifies them.
+        # The sum owns and modifies the tensors that are added.
         total.add(
             {
                 name: None if gradient is None else gradient.clone()
@@ -111,7 +111,7 @@ def _answer(operator: Operator, context: AggregateContext) -> AggregateResult:
 def every_tensor_is_answered(make: Make[Operator]) -> None:
     """The result contains a finite gradient of the right shape for every tensor.
 
-    An operator without `separate = True` returns the same gradients if it receives only the sum.
+    An operator without `separate = True` returns equal gradients if only the sum is available.
     """
     operator = make()
     for views in admitted(operator.views):
@@ -140,7 +140,7 @@ def _require_gradient(what: str, gradient: Tensor | None, shape: tuple[int, ...]
 def absent_views_have_no_weight(make: Make[Operator]) -> None:
     """A view without a valid gradient has no influence.
 
-    A gradient is invalid if it is missing, zero or not finite.
+    A gradient is invalid if the gradient is missing, zero or not finite.
     """
     operator = make()
     for views in admitted(operator.views):
@@ -165,7 +165,10 @@ def _require_same(what: str, one: Tensor | None, other: Tensor | None) -> None:
 
 
 def gradients_stay_untouched(make: Make[Operator]) -> None:
-    """The operator does not change the gradients of the views. Other plugins read them later."""
+    """The operator does not change the gradients of the views.
+
+    Other plugins read the gradients of the views later.
+    """
     operator = make()
     for views in admitted(operator.views):
         gradients, copies = sample_gradients(views), sample_gradients(views)
@@ -178,7 +181,7 @@ def gradients_stay_untouched(make: Make[Operator]) -> None:
 
 
 def same_seed_same_aggregation(make: Make[Operator]) -> None:
-    """Two calls with the same seed return the same bits.
+    """Two calls with equal seeds return equal bits.
 
     The returned states survive a checkpoint.
     """

@@ -33,7 +33,7 @@ def unknown_options_are_refused(make: Make[Component]) -> None:
 
 
 def options_survive_the_configuration_file(make: Make[Component]) -> None:
-    """Options that are written to config.yaml are equal after they are read again."""
+    """Options that are written to config.yaml and read again are equal to the original options."""
     component = make()
     try:
         again = type(component).model_validate(component.model_dump(mode="json"))

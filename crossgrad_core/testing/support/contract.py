@@ -32,7 +32,8 @@ Make = Callable[[], C]
 #: check does not apply.
 Check = Callable[[Make[C]], None]
 
-#: Numbers of views per step that the checks try, as far as the component supports them.
+#: Numbers of views per step that the checks try. Numbers that the component does not support are
+#: skipped.
 VIEW_COUNTS = range(1, 7)
 
 
@@ -68,7 +69,7 @@ def admitted(views: ViewCounts) -> tuple[int, ...]:
 
 
 def revived(state: PluginState) -> PluginState:
-    """Return the state as it would be after a checkpoint.
+    """Return the state after a simulated checkpoint.
 
     Values are converted to JSON and back, and tensors are copied.
 

@@ -49,8 +49,8 @@ def require_bounded(sizes: Iterable[int], method: str) -> None:
     """Require that the state of a run stops growing after some steps.
 
     Args:
-        sizes: Size of the state after each step of a long run. The iterable computes each size only
-            when it is needed.
+        sizes: Size of the state after each step of a long run. The iterable computes a size only on
+            demand.
         method: Name of the method that returns the state.
     """
     steps = iter(sizes)

@@ -152,7 +152,7 @@ class _Drawn:
     """The outputs and gradients of one render, as float64 tensors on the CPU.
 
     Attributes:
-        pixels: Image, alpha and, if the rasterizer provides it, depth.
+        pixels: Image, alpha and, for rasterizers that provide it, depth.
         gradients: Gradients of the tensors of the Gaussians, and gradients in the screen
             statistics.
     """
@@ -282,7 +282,7 @@ def its_options_are_heeded(make: Make[Rasterizer]) -> None:
 
 
 def views_drawn_together_are_the_same(make: Make[Rasterizer]) -> None:
-    """`render_views` returns the same images as `render` for each single view.
+    """`render_views` returns the images that `render` returns for each single view.
 
     Each view has its own background.
     """

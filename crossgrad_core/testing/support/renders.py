@@ -1,7 +1,7 @@
 """Contexts of hooks outside a run: parameters, Gaussians, renders on request, and view records.
 
-In a run, some rows are updated only when a hook reads them. The contexts of a run therefore use
-special types instead of a plain dictionary and plain Gaussians.
+In a run, some rows are updated only on demand, when a hook reads these rows. The contexts of a run
+therefore use special types instead of a plain dictionary and plain Gaussians.
 """
 
 from collections.abc import Mapping

@@ -100,7 +100,7 @@ def require_sound(run: ShortRun) -> None:
 
 
 def require_repeated(run: ShortRun, again: ShortRun) -> None:
-    """Require that two runs with the same seed give bit-identical results."""
+    """Require that two runs with equal seeds give bit-identical results."""
     for step, (one, other) in enumerate(zip(run.records, again.records, strict=True), 1):
         for what in ("views", "losses", "counts"):
             pair = getattr(one, what), getattr(other, what)

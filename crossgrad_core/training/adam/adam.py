@@ -38,7 +38,8 @@ def adam_step(  # noqa: PLR0913 - all options of an optimizer step are arguments
     A tensor without a gradient (None or absent) keeps its value, moments and step count. The
     constants in `coefficients` limit gradients that are too small or too large for float32
     arithmetic. For gradients of magnitude 1e-17 to 1e18, the result equals `torch.optim.Adam` up to
-    rounding. As in torch, a NaN element of a gradient makes the same element of the parameter NaN.
+    rounding. As in torch, a NaN element of a gradient makes the corresponding element of the
+    parameter NaN.
 
     Args:
         params: Floating-point tensors of any shape, by name.
@@ -145,7 +146,7 @@ def update_on_gpu(
         [exp_avg],
         [exp_avg_sq],
         [],
-        # torch's Adam adds 1 to the step count before it uses the count.
+        # torch's Adam first adds 1 to the step count.
         [torch.full((), step.age - 1, dtype=torch.float32, device=param.device)],
         fused=True,
         amsgrad=False,

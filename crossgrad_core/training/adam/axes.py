@@ -1,9 +1,8 @@
 """Position steps in proportion to the size of each Gaussian, separately along each of its axes.
 
-Adam gives all positions steps of about the same length. With equal steps, a small Gaussian on a
-near wall jumps over its neighbours, while a large Gaussian on the ground below a drone hardly
-moves. A scene with very different camera distances contains small and large Gaussians
-(docs/schedules.md).
+Adam gives all positions steps of about equal length. With equal steps, a small Gaussian on a near
+wall jumps over its neighbours, while a large Gaussian on the ground below a drone hardly moves. A
+scene with very different camera distances contains small and large Gaussians (docs/schedules.md).
 """
 
 from math import inf, log, nan
@@ -28,8 +27,8 @@ def step_along_axes(positions: Tensor, steps: Tensor, scales: Tensor, quats: Ten
     """Add steps to positions in place, after stretching each step along the axes of its Gaussian.
 
     The length of a step does not change along an axis of typical length. Each Gaussian has three
-    axis lengths. The typical length is the median, over all Gaussians, of the middle one of these
-    three lengths.
+    axis lengths. The typical length is a median over all Gaussians. For each Gaussian, the middle
+    one of its three axis lengths is used.
 
     Args:
         positions: [N, 3].
@@ -62,10 +61,10 @@ def stretched(steps: Tensor, factors: Tensor, quats: Tensor) -> Tensor:
 
 
 def _usual(scales: Tensor) -> Tensor | float:
-    """Return the median over a sample of the Gaussians of the middle one of their three log scales.
+    """Return the median of the Gaussians' middle log scales, computed over a sample.
 
-    The sample is evenly spread over the rows. Non-finite values are left out, because they would
-    affect the steps of all Gaussians.
+    The sample is evenly spread over the rows. Non-finite values are left out, because a NaN median
+    would affect all Gaussians.
     """
     sample = scales[:: -(-len(scales) // _SAMPLE)]
     if is_native([sample]):  # For this small sample, NumPy has less overhead than torch.

@@ -2,8 +2,8 @@
 
 A row that was not rendered has a gradient of zero, but Adam still moves the row by its decaying
 moments. The deferred steps of a row are applied when the row is next rendered, or when the whole
-tensor is read. Deferred steps use the same float32 operations in the same order as immediate steps.
-The results are therefore bit-identical.
+tensor is read. Deferred steps use the float32 operations of immediate steps, in the same order. The
+results are therefore bit-identical.
 
 Steps run in background threads while the calling thread continues with serial work. Code that reads
 the tensor waits until the step is complete.

@@ -1,4 +1,4 @@
-"""Reduce an image: each new pixel is the mean of the image area that it covers (Numba, CPU)."""
+"""Reduce an image: each new pixel is the mean of an area of the image (Numba, CPU)."""
 
 from math import ceil
 

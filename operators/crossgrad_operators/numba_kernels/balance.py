@@ -75,7 +75,7 @@ def _graded(norms: Pairs, cosines: Pairs, exact: Exact) -> Pairs:
 
     The diagonal matrix D contains the norms, divided by the largest norm.
 
-    D C D has the same rank as C. If the ratio of norms is large, the eigenvalues of D C D do not
+    D C D and C have equal ranks. If the ratio of norms is large, the eigenvalues of D C D do not
     show this rank.
     """
     n = len(norms)
@@ -338,7 +338,7 @@ def nash(
 ) -> Solved:
     """Return weights alpha with G alpha = 1 / alpha, multiplied by the geometric mean of the norms.
 
-    Arguments and results are the same as in `imtl_g`.
+    `imtl_g` describes the arguments and results.
     """
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
@@ -367,7 +367,7 @@ def aligned(
 ) -> Solved:
     """Return the weights sqrt(l_min) V L^-1/2 V^T p with p = 1/K and the Gramian G = V L V^T.
 
-    Arguments and results are the same as in `imtl_g`.
+    `imtl_g` describes the arguments and results.
     """
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
@@ -376,7 +376,7 @@ def aligned(
         n = places.size
         if n == 0:
             continue
-        # The relative errors of the eigenvalues of D C D are the same as of the eigenvalues of C.
+        # The eigenvalues of D C D and of C have equal relative errors.
         pivot = smallest_pivot(cosines[:, :, 0].copy(), n)
         ill_conditioned[b] = n > 1 and CAUTION * n * EPSILON > unit * pivot
         matrix, vectors = _graded(norms, cosines, exact), np.empty((n, n, 2))
@@ -390,8 +390,8 @@ def aligned(
         ones[:, 0] = 1.0
         for i in kept:
             inner = products(vectors[:, i], ones, 0, n, exact)
-            # Skip eigenvectors that are orthogonal to p, because they would add only rounding
-            # noise.
+            # Skip eigenvectors that are orthogonal to p, because such eigenvectors would add only
+            # rounding noise.
             if abs(inner[0]) > OPPOSITE:
                 ratio = quotient(at(matrix[least], least), at(matrix[i], i), exact)
                 factor = product(root(ratio, exact), inner, exact)

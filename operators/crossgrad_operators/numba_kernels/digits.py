@@ -2,7 +2,7 @@
 
 A number is a pair (high, low) of float64 numbers. `exact` is True for 32 digits and None for 16
 digits. With 16 digits, the low part is always 0. None and True have different types in Numba. Numba
-therefore compiles a separate kernel for each of them.
+therefore compiles a separate kernel for each of the two values.
 """
 
 from typing import Final, Literal

@@ -59,7 +59,7 @@ def confident(
 
 @strict_device
 def _scale(logs: Floats, active: Flags) -> None:
-    """Shift log weights such that the sum of the active weights equals their number."""
+    """Shift log weights such that the active weights add up to the number of active groups."""
     largest = -np.inf
     count = 0
     for s in range(logs.size):
@@ -80,7 +80,7 @@ def _scale(logs: Floats, active: Flags) -> None:
 def _group_lengths(gramian: Floats, group: Indices, lengths: Floats) -> None:
     """Write the length of each group's summed gradient to `lengths` [S].
 
-    Write 0 if it is only rounding noise.
+    A length that is only rounding noise becomes 0.
     """
     views = group.size
     longest = np.zeros(lengths.size)

@@ -188,7 +188,7 @@ def _rotate(matrix: Pairs, vectors: Pairs, p: int, q: int, exact: Exact) -> None
 def eigen(matrix: Pairs, vectors: Pairs, exact: Exact) -> Floats:
     """Return the eigenvalues [n] of a positive semi-definite matrix.
 
-    The diagonal of `matrix` also contains them.
+    The eigenvalues are also on the diagonal of `matrix`.
 
     The function uses Jacobi's method. The method stops when |a_ij| <= eps sqrt(a_ii a_jj) for all
     elements a_ij. With this rule, small eigenvalues of a matrix D C D also have small relative

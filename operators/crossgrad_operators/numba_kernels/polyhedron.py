@@ -8,8 +8,8 @@ e_k are linearly dependent, the nearest point is unique, but the multipliers are
 
 The cosines contain rounding errors, so the smallest eigenvalues of the cosine matrix are unknown. A
 small number (the ridge) is therefore added to the diagonal, so that the matrix becomes positive
-definite. The ridge keeps the multipliers bounded, and makes them continuous functions of the
-cosines. If the ridge affects the result visibly, the solution is repeated, starting from the
+definite. The ridge keeps the multipliers bounded, and makes the multipliers continuous functions of
+the cosines. If the ridge affects the result visibly, the solution is repeated, starting from the
 previous solution (proximal point iteration). After this, the component along an eigenvector with
 eigenvalue l is too small only by the share (ridge / (l + ridge))^ROUNDS. If the directions are not
 nearly dependent, one round is enough.
@@ -62,7 +62,7 @@ class Rounding(NamedTuple):
         slack: A constraint counts as violated if the violation exceeds this share of its terms.
         shown: The effect of the ridge is corrected if the ridge exceeds this share of a pivot.
         noise: Rounding error of |sum x_k e_k|^2, relative to sum x_k^2. Opposite gradients with
-            half as many digits can differ by the same amount.
+            half as many digits can differ by such an amount.
     """
 
     exact: Exact
@@ -200,8 +200,8 @@ def substitute(problem: Polyhedron, count: int, right: Pairs, out: Pairs) -> Non
 def _first_zero(problem: Polyhedron, count: int) -> tuple[float, int]:
     """Return the share of the step after which a multiplier becomes zero.
 
-    The second result is the number of the constraint to which this multiplier belongs. Without such
-    a multiplier, return (1, -1).
+    The second result is the number of the constraint to which this multiplier belongs. If no
+    multiplier becomes zero, return (1, -1).
     """
     share, leaving = 1.0, -1
     for i in range(count):

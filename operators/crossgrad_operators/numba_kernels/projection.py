@@ -55,7 +55,7 @@ def _as_row(v: Pairs, norms: Pairs, i: int, row: Floats, exact: Exact) -> None:
 def _remaining(v: Pairs, cosines: Pairs, exact: Exact) -> Pair:
     """Return the length of a projected vector.
 
-    If the vector is only rounding noise, it is set to zero.
+    A vector that is only rounding noise is set to zero.
     """
     square, longest = form(v, cosines, exact), np.abs(v[:, 0]).max()
     if square[0] <= CANCELLED * longest * longest:
@@ -173,7 +173,8 @@ def aligned_to_targets(
 
     For each i and all j in order[i]: phi = cos(v, g_j). If phi is below the target t_ij, a multiple
     of g_j is added to v, so that the cosine becomes t_ij. Then t_ij <- (1 - beta) t_ij + beta phi,
-    clipped to +-0.999. A vector v becomes exactly zero under the same conditions as in `projected`.
+    clipped to +-0.999. A vector v becomes exactly zero under the conditions that `projected`
+    describes.
 
     Args:
         gramians: [B, K, K] Gramians.

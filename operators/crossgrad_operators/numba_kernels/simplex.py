@@ -57,8 +57,8 @@ from crossgrad_operators.numba_kernels.polyhedron import (
 #: Maximum number of levels that the search tries. About five levels are usually enough.
 LEVELS = 60
 #: The search ends when the active constraints no longer change and the change of the level is small
-#: or changes its sign. A change is small if it is at most this share of the level. Later rounds
-#: correct the remaining error.
+#: or changes its sign. A change is small if its magnitude is at most this share of the level. Later
+#: rounds correct the remaining error.
 CLOSE = 1e-6
 #: If the ridge adds more than this share of rho^2 to the squared distance, the directions may
 #: cancel each other.
@@ -239,9 +239,9 @@ def _find_level(problem: Polyhedron, search: Search, level: Pair, ridge: float) 
 
     The multipliers of this point are computed, too.
 
-    The distance is a convex and increasing function of the level. The function is solved piece by
-    piece; on each piece, the active constraints are the same. If a solution is outside the interval
-    that contains the level, the interval is halved instead.
+    The distance is a convex and increasing function of the level. The function consists of pieces
+    with different active constraints, which are solved one after another. If a solution is outside
+    the interval that contains the level, the interval is halved instead.
     """
     exact, before = problem.rounding.exact, np.zeros(problem.active.size, np.bool_)
     low, high = _limits(search)

@@ -144,7 +144,7 @@ def complementary(matrix: Matrix, offset: Sequence[Number]) -> Vector | None:
     The function uses the active-set method of Lawson and Hanson, and checks the result. In each
     step, the most violated constraint becomes active. If the column of this constraint is a
     combination of active columns, an active constraint is removed first. M may therefore be
-    singular. If there is no solution, the function returns None.
+    singular. If no solution exists, the function returns None.
     """
     mp = require_mpmath().mp
     x = [mp.mpf(0)] * len(matrix)

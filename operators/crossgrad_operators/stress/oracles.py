@@ -39,7 +39,7 @@ class Question:
         options: Options of the operator.
         labels: [n] labels of the groups of the views.
         ratios: [n] camera distances, divided by the reference distance.
-        rng: A random generator that draws the same numbers as the operator's generator.
+        rng: A random generator that draws the numbers that the operator's generator draws.
         memory: Values that the oracle stored in earlier steps. The oracle may change this
             dictionary.
     """
@@ -127,7 +127,10 @@ def projected_rows(
 
 
 def partners_of(question: Question, *, shuffled: bool) -> list[list[int]]:
-    """For each view that has a gradient, return the other such views in the order of projection."""
+    """Return the partners of each view that has a gradient.
+
+    The partners are the other views with a gradient, in the order of projection.
+    """
     order = np.tile(np.arange(question.views), (question.views, 1))
     if shuffled and question.views > 2:  # noqa: PLR2004
         order = question.rng.permuted(order, axis=1)
@@ -163,7 +166,7 @@ class _Combination:
     def length(self) -> Number:
         """The length of the sum.
 
-        The length is exactly zero if it is below 1.4e-6 times the longest summand.
+        A length below 1.4e-6 times the longest summand is returned as exactly zero.
         """
         square = dot(self.v, self.products)
         longest = max(abs(x) * n for x, n in zip(self.v, self._norms, strict=True))
@@ -203,7 +206,7 @@ def column_sums(rows: Matrix) -> Vector:
 
 
 def pcgrad(question: Question) -> Vector:
-    """Return the weights of PCGrad with the same random order as the operator."""
+    """Return the weights of PCGrad with the random order of the operator."""
     return column_sums(projected_rows(question, shuffled=True))
 
 
@@ -257,7 +260,7 @@ def _believed(question: Question, pair: tuple[int, int], cosine: Number) -> bool
 def gradvac(question: Question) -> Vector:
     """Return the weights of GradVac with stored targets.
 
-    The random order is the same as in the operator.
+    The random order is the order of the operator.
     """
     rows = [
         _aligned(question, i, partners)

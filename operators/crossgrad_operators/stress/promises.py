@@ -1,4 +1,4 @@
-"""The accuracy that each operator guarantees, and the set of gradients for which it is guaranteed.
+"""The accuracy that each operator guarantees, and the gradients for which it is guaranteed.
 
 Inside this set, the relative error is at most `PROMISED` u kappa. Here u is the unit roundoff of
 the gradients' type, and kappa = max |w_k| |g_k| / |result|. Outside the set, the result is finite.
@@ -139,7 +139,7 @@ def default_bound(facts: Facts) -> float:
 def pairwise_bound(facts: Facts) -> float:
     """Return the default bound, but twice as large for float64 gradients.
 
-    For float64 gradients, Gramians have only the same precision as the gradients.
+    For float64 gradients, Gramians are only as precise as the gradients.
     """
     return default_bound(facts) * (1.0 if facts.unit > FLOAT64 else 2.0)
 

@@ -93,7 +93,7 @@ def judged(
 ) -> tuple[Finding, list[float]]:
     """Return the worst finding over all steps, and the seconds of each step.
 
-    After a failure, there are no seconds.
+    After a failure, the list of seconds is empty.
 
     Args:
         operator: The operator to check.

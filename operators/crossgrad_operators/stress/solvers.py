@@ -71,8 +71,8 @@ def imtl_g(question: Question) -> Vector:
         return zeros(2) if opposite else [n[1] / total, n[0] / total]
     v = _equal_projections(gramian, n, cosine)
     total, largest = sum(v), max(abs(x) for x in v)
-    # The sum of all elements of v is a denominator. The rule for cancelling sums decides whether it
-    # counts as zero.
+    # The sum of all elements of v is a denominator. The rule for cancelling sums decides whether
+    # this sum counts as zero.
     if cancels(total**2, largest) or is_noise(cosine, [x * y for x, y in zip(v, n, strict=True)]):
         return zeros(count)
     return [x / total for x in v]
@@ -300,7 +300,7 @@ def cagrad(question: Question) -> Vector:
 def _as_far_as(cosine: Matrix, base: Vector, r: Vector, rho: Number) -> Vector | None:
     """Return the multipliers of the point nearest to `base` with e_k.d >= level r_k.
 
-    The level is chosen such that the distance is rho.
+    The level is the one for which the distance is rho.
 
     Return None if 0 is a convex combination and level 0 is reached within this distance. No level
     above 0 can then be reached, and the direction is undefined.

@@ -38,9 +38,9 @@ class Finding:
     """The verdict on one result.
 
     Attributes:
-        verdict: `ok`, `undetermined` (kappa u > 0.1, result finite), `outside` (outside the set
-            with a guaranteed accuracy; finite and not too long), `refused` (K is not supported) or
-            `failed`.
+        verdict: `ok`, `undetermined` (kappa u > 0.1, result finite), `outside`, `refused` (K is not
+            supported) or `failed`. The verdict `outside` means: outside the set with a guaranteed
+            accuracy, finite, and not too long.
         error: Relative error in units of u kappa; NaN without a reference.
         reason: Reason of the failure; empty without a failure.
         ratio: Length |u| of the result, divided by the longest gradient; NaN inside the set.
@@ -85,7 +85,7 @@ def judge(
 ) -> Finding:
     """Compare a result with exact weights or with a rule for elements.
 
-    Without either, check that it is finite.
+    If neither is available, check only that the result is finite.
     """
     if found is None or not exact.touched:
         return _either(

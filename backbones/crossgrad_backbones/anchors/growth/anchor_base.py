@@ -24,8 +24,8 @@ from crossgrad_core.plugin import (
 
 #: Sums for each anchor [P]: opacities of its Gaussians, and number of views that decoded it.
 OPACITY, VIEWS = "opacity", "views"
-#: Sums for each offset [P, k]: gradient norms of its Gaussian, and number of renders in which it is
-#: visible.
+#: Sums for each offset [P, k]: gradient norms of its Gaussian, and number of renders in which this
+#: Gaussian is visible.
 GRADIENT, RENDERS = "gradient", "renders"
 
 
@@ -128,7 +128,7 @@ class NewAnchors:
     def and_more(self, more: "NewAnchors") -> "NewAnchors":
         """Append anchors.
 
-        The present and the appended anchors must contain the same `further` tensors.
+        The present and the appended anchors must contain equal names in `further`.
         """
         return NewAnchors(
             torch.cat([self.positions, more.positions]),
@@ -158,8 +158,8 @@ class AnchorDensifier(Densifier):
     """A densifier that adds anchors where gradients are large, and removes transparent anchors.
 
     A subclass decides where anchors are added. All other rules are the rules of Scaffold-GS. After
-    a decision about an offset or an anchor, its sums are reset to zero. A rarely visible anchor
-    keeps its sums until it was visible often enough for a decision.
+    a decision about an offset or an anchor, its sums are reset to zero. An anchor that is rarely
+    visible keeps its sums, until they suffice for a decision.
     """
 
     tensors: ClassVar[frozenset[str]] = frozenset({"anchors", "offsets", "features", "scales"})

@@ -26,7 +26,7 @@ def in_frustum(
 ) -> None:
     """Write a mask of the anchors inside the frustum.
 
-    The formulas are the same as in the torch version.
+    The formulas are those of the torch version, `_plain`.
 
     Args:
         jobs: Job counters, passed by `parallel` or `serial`.

@@ -32,7 +32,7 @@ _Four = tuple[Lanes, Lanes, Lanes, Lanes]
 
 @device
 def _stretched(steps: _Three, factors: _Three, quats: _Four) -> _Three:
-    """Rotate steps into the axes of the Gaussians, stretch them, and rotate them back.
+    """Rotate steps into the axes of the Gaussians, stretch the steps, and rotate the steps back.
 
     A quaternion that is nearly zero counts as the identity.
     """

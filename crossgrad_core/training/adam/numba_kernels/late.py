@@ -49,8 +49,8 @@ NUMBERS = 7
 #: contiguous memory for one call of `update`.
 _ROWS = 1024
 _GATHERED = 128
-#: Number of gradient elements that `update_all` gathers at a time; it is a multiple of the cache
-#: line for rows of any width. The gathered gradients fit into the first-level cache together with
+#: Number of gradient elements that `update_all` gathers at a time. For rows of any width, this is a
+#: multiple of a cache line. The gathered gradients fit into the first-level cache together with
 #: their parameters and moments.
 _AT_ONCE = 768
 #: Largest number of consecutive long rows that are updated in one call.
@@ -60,8 +60,8 @@ _SIDE_BY_SIDE = 16
 _LINE, _AHEAD = 16, 6
 #: Number of steps between two checks whether the parameters still change.
 _LOOK = 32
-#: If a step is below 2^-25 of a parameter (half a unit in the last place), it does not change the
-#: parameter. The limit here is 2^-26, because the estimate itself has rounding errors.
+#: A step below 2^-25 of a parameter (half a unit in the last place) does not change the parameter.
+#: The limit here is 2^-26, because the estimate itself has rounding errors.
 _STILL = np.float32(2.0**-26)
 # Second moments above this value stay normal numbers for `_LOOK` steps with beta2 >= 1/2.
 _STEADY = np.float32(2.0**-90)

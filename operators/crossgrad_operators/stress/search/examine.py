@@ -18,7 +18,7 @@ from crossgrad_operators.stress.verdict import ExactCase, Finding, by_law, facts
 
 Floats = NDArray[np.float64]
 
-#: Factor for gradients, a power of two. Results must be multiplied by the same factor.
+#: Factor for gradients, a power of two. Results must be multiplied by this factor, too.
 _SCALE: Final = 2.0**20
 #: Relative change of gradients. Results must change only a little.
 _NUDGE: Final = 1e-12
@@ -78,7 +78,7 @@ def largest_jump(
 
     The change is divided by the length of the longest gradient. Cases in which the operator is not
     continuous are skipped. If all candidates are skipped, the function returns None. The gradients
-    are converted to float64, so that such a small change is represented accurately.
+    are converted to float64, in which a change of 1e-12 is represented accurately.
     """
     wide = replace(batch, dtype=torch.float64)
     noise = _NUDGE * rng.standard_normal(batch.rows.shape)

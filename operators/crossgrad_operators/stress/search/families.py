@@ -32,7 +32,7 @@ BLOCK = Block("means", ("means",), True, "geometry", LearningRate(1.0))
 def cases_of(views: int) -> int:
     """Return the number of cases in a batch.
 
-    Cases with many views take longer, so that a batch contains fewer such cases.
+    Cases with many views take longer, so that a batch contains fewer cases with many views.
     """
     return max(1, _CASES // views**2)
 
@@ -78,7 +78,7 @@ def integers(rng: np.random.Generator, blocks: int, views: int, elements: int) -
 def low_rank(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
     """Return rows of rank 1 to 3.
 
-    Half of them are integers, whose rank rounding does not change.
+    Half of the rows are integers, whose rank rounding does not change.
     """
     rank = int(rng.integers(1, 4))
     factors = _normal(rng, blocks, views, rank)
@@ -159,7 +159,7 @@ FAMILIES: Final[Mapping[str, Family]] = {
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """B cases of the same size.
+    """B cases of equal size.
 
     Attributes:
         rows: [B, K, P] gradients, exactly represented in their type.

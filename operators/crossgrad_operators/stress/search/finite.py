@@ -31,7 +31,7 @@ class Finite:
         not_finite: Number of cases whose result is not finite.
         longest: Largest length |u| of a result, divided by the length of the longest gradient.
         seconds: Duration of the check in seconds.
-        example: A case whose result is not finite; None without such a case.
+        example: A case whose result is not finite; None if all results are finite.
     """
 
     operator: str
@@ -67,8 +67,8 @@ def run_finite(
 
 def _batch(subject: Subject, dtype: torch.dtype, count: int, seed: tuple[int, int]) -> Batch:
     rng = np.random.default_rng(seed)
-    # Two successive batches belong to the same family of gradients. The gradients of these two
-    # batches have different types.
+    # Two successive batches belong to one family of gradients. The gradients of these two batches
+    # have different types.
     family = list(FAMILIES)[seed[1] // 2 % len(FAMILIES)]
     views = int(rng.integers(2, VIEWS + 1))
     if not subject.operator.views.admits(views):

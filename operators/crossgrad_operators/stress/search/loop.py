@@ -39,8 +39,7 @@ class Extent:
     """The start and the length of a search.
 
     Attributes:
-        seed: Seed of all random numbers. A longer search begins with the same cases as a shorter
-            search.
+        seed: Seed of all random numbers. A longer search begins with the cases of a shorter search.
         seconds: No new round begins after this time.
         rounds: Largest number of rounds; None without a limit.
         dtypes: Types of the gradients, used in turn.

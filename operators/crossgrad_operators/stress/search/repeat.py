@@ -16,7 +16,7 @@ from crossgrad_operators.stress.verdict import ExactCase, Finding
 
 
 def read_rows(text: str, dtype: torch.dtype) -> Case:
-    """Return the case that a text such as [[1,2],[3,4]] describes. Each row belongs to one view.
+    """Return the case that a text describes, such as [[1,2],[3,4]]. Each row belongs to one view.
 
     Raises:
         UserError: The text is not a matrix of finite numbers.

@@ -41,7 +41,7 @@ class Sample:
         return str(self.dtype).removeprefix("torch.")
 
     def text(self) -> str:
-        """Return the rows as text from which they can be read again exactly."""
+        """Return the rows as text, with enough digits to read the rows again exactly."""
         number = np.float32 if self.dtype == torch.float32 else np.float64
         rows = [[_shortest(number(value)) for value in row] for row in self.rows]
         return "[" + ",".join("[" + ",".join(row) + "]" for row in rows) + "]"

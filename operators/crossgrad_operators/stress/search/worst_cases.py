@@ -26,7 +26,7 @@ KEPT = 5
 
 @dataclass
 class WorstCases:
-    """Counts and worst cases of one operator. Every batch updates them.
+    """Counts and worst cases of one operator. Every batch updates these counts and cases.
 
     Attributes:
         operator: Name of the operator.
@@ -41,7 +41,7 @@ class WorstCases:
         inside_pool: The cases with the largest errors inside the set, in descending order.
         outside_pool: The cases with the longest results outside the set, relative to the longest
             gradient.
-        jump: The case whose result changes most, although the operator is continuous there.
+        jump: The case whose result changes most although the operator is continuous.
         failures: Some of the cases that break a guarantee, with the reasons.
     """
 
