@@ -20,14 +20,14 @@ FLOOR = 1e-4
 def as_plain(
     gaussians: Gaussians, cameras: Sequence[Camera], blur: float, near: float
 ) -> Gaussians:
-    """Convert Gaussians such that a plain render gives the same image as their own pixel response.
+    """Convert the Gaussians of Mip-Splatting such that a plain 3DGS render gives the same image.
 
     The response adds the variance `blur` to the 2-D covariance S, and keeps opacity times sqrt(det
-    S) constant. A 3DGS viewer adds a larger variance, the dilation. The difference between dilation
-    and `blur` is therefore first subtracted from the 3-D variances. For this, a pixel at depth z
-    has the width z / f in local units, with the focal length f. S' is the 2-D covariance after the
-    subtraction. The opacity is multiplied by sqrt(det S / det(S' + dilation)), the ratio of the
-    footprints.
+    S) constant. A 3DGS viewer adds a larger variance, the dilation. The difference between the
+    dilation of the viewer and `blur` is therefore first subtracted from the 3-D variances. For
+    this, a pixel at depth z has the width z / f in local units, with the focal length f. S' is the
+    2-D covariance after the subtraction. The opacity is multiplied by sqrt(det S / det(S' +
+    dilation)), the ratio of the footprints.
 
     The 3-D variances are computed for the camera with the smallest pixels at the Gaussian. The
     opacity is computed for the camera with the largest ratio. If means over the cameras were used

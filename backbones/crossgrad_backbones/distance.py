@@ -135,14 +135,15 @@ class DistanceConditioned(Vanilla):
     """The 3DGS representation with scales, opacities and colours that are linear in D = (z, z^2).
 
     z is the standardised logarithm of the camera's distance from the mean of the training cameras.
-    Each Gaussian has weights w, and the dot product of w and D is added to an attribute. The
-    attributes are the log scales (with a common term for all three), the opacity logit, and each
-    coefficient of SH degree 0. Each attribute has its own weights. All weights start at 0, so that
-    the initial model is bit-identical to `vanilla`. Two penalties on the weights increase linearly
-    during the run: their squared length, and the squared derivative of the added terms with respect
-    to z. Blocks: the blocks of `vanilla`, `distance_scales` [N, 1, 2], `distance_opacities` [N, 2],
-    `distance_f_dc` [N, 1, 3, 2], and `distances` [7]. Source: arXiv 2605.00052,
-    Distance-Conditioned Attributes. crossgrad chose the encoding and the default values.
+    Each Gaussian has weights w, and the dot product of w and D is added to each attribute below.
+    The attributes are the log scales (with a common term for all three), the opacity logit, and
+    each coefficient of SH degree 0. Each attribute has its own weights. All weights start at 0, so
+    that the initial model is bit-identical to `vanilla`. Two penalties on the weights increase
+    linearly during the run: their squared length, and the squared derivative of the added terms
+    with respect to z. Blocks: the blocks of `vanilla`, `distance_scales` [N, 1, 2],
+    `distance_opacities` [N, 2], `distance_f_dc` [N, 1, 3, 2], and `distances` [7]. Source: arXiv
+    2605.00052, Distance-Conditioned Attributes. crossgrad chose the encoding and the default
+    values.
     """
 
     plain: ClassVar[bool] = False
@@ -164,7 +165,8 @@ class DistanceConditioned(Vanilla):
     smoothness_weight: float = Field(
         0.01,
         ge=0,
-        description="final weight of the mean squared derivative by the log distance in the loss",
+        description="final weight in the loss of the mean squared derivative with respect to the "
+        "log distance",
     )
 
     @override

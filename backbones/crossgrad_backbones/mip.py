@@ -118,7 +118,7 @@ class _Smoothed(torch.autograd.Function):
 def _finite_scales(log_scales: Tensor) -> Tensor:
     """Return exp(log_scales), limited to the range of the floating-point type.
 
-    Every quotient is then defined.
+    With finite scales, every quotient of scales is defined.
     """
     limits = torch.finfo(log_scales.dtype)
     return log_scales.exp().clamp_(limits.tiny, limits.max)

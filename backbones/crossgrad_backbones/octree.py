@@ -72,9 +72,9 @@ def init_anchors(points: NDArray[np.float64], lattice: Lattice, *, everywhere: b
     Each point is rounded to the nearest site, and duplicates are removed.
 
     Initial scales come from the distances between sites of the same level, including sites without
-    an anchor. The published code uses distances to anchors of any level. Coarse anchors then start
-    as small as neighbouring fine anchors. A distant camera uses only coarse anchors. With such
-    small Gaussians, its image would show gaps.
+    an anchor. The published code uses distances to anchors of any level. With these distances,
+    coarse anchors start as small as neighbouring fine anchors. A distant camera uses only coarse
+    anchors. With such small Gaussians, its image would show gaps.
 
     Args:
         points: [P, 3] points in local units.
@@ -130,7 +130,7 @@ def visible_share(shares: Tensor, asked: float) -> float:
 
 
 Rounding = Literal["round", "floor", "ceil", "progressive"]
-#: Rounding of L* -> how many levels above L* a camera uses (see `Lattice.lead`).
+#: Rounding of L* -> number of levels above L* that a camera uses (see `Lattice.lead`).
 _LEADS: Mapping[Rounding, float] = {"round": 0.5, "floor": 0.0, "ceil": 1.0, "progressive": 1.0}
 
 

@@ -109,7 +109,7 @@ class DeferredSums(Gradients):
 
     @cached_property
     def _read(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Two arrays [B, K] over blocks and views.
+        """Two arrays [B, K] with an element for each block and view.
 
         The first is True for finite gradients, the second for finite non-zero gradients.
         """

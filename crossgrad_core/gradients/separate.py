@@ -47,7 +47,7 @@ class DenseGradients(SeparateGradients):
             does not touch the tensor.
         blocks: The blocks of the backbone, in the order of the first dimension of Gramians.
         overwrite: True if `combine` and `total` may write their results into the gradients of one
-            view. Overwriting saves memory, but the gradients can then be used only once.
+            view. Overwritten gradients save memory, but can be used only once.
     """
 
     def __init__(
@@ -161,7 +161,7 @@ class DenseGradients(SeparateGradients):
     def _rows(self) -> tuple[int, ...]:
         """Number of Gramians of each block for granularity `gaussian`.
 
-        Each primitive then has its own Gramian.
+        With this granularity, each primitive has its own Gramian.
         """
         self._unpack()
         shapes = {

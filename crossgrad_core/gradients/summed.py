@@ -20,7 +20,7 @@ from crossgrad_core.gradients.sparse_rows import PackedRows
 def plain_sums(columns: Sequence[Column], divisor: int, *, keep: bool) -> list[Tensor | None]:
     """Add the gradients of each column in their own type, in the order of the views.
 
-    Then divide the sums.
+    After the addition, divide the sums by `divisor`.
 
     Args:
         columns: T columns of contiguous gradients, dense or sparse in rows; None is left out.

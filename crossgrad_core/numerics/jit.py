@@ -103,7 +103,7 @@ def device(function: Callable[P, R]) -> Callable[P, R]:
 def sum_kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile like `kernel`, but let sums use vector lanes.
 
-    The machine code then determines the order of the summands.
+    The machine code of the kernel determines the order of the summands.
     """
     return compiled(function, fastmath={*_FLAGS, "reassoc"})
 

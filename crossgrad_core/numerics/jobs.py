@@ -9,14 +9,14 @@ A kernel takes jobs until no job is left:
 
 `parallel` calls the kernel on all threads at the same time. Numba's own `prange` divides the work
 into equal parts in advance, and waits for all threads. If another program uses a core, this wait
-can take longer than the computation with one thread. Here, a helper thread that starts too late is
-not waited for, and idle threads sleep.
+can take longer than the computation with one thread. In this module, a helper thread that starts
+too late is not waited for, and idle threads sleep.
 
 Each thread begins with its own range of jobs, and then continues with jobs from the ranges of other
 threads. A thread therefore often reads data that the same thread wrote in the previous kernel. Data
 from the previous kernel are still in the cache of the thread's core. The result of a job must not
-depend on the thread that executes the job. The number of threads then does not change any bit of
-the results.
+depend on the thread that executes the job. With this property, no bit of the results depends on the
+number of threads.
 """
 # ruff: noqa: ANN401, ARG001 - Numba's objects have no types, and Numba defines the arguments.
 

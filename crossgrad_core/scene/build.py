@@ -106,7 +106,7 @@ def _all_blank(names: Sequence[str], root: Path) -> UserError:
 def with_points_of_file(raw: RawScene, option: Path | None) -> RawScene:
     """Replace the points of a scene by the points of a file.
 
-    No photo then has observations of points.
+    The photos of the result have no observations of points.
 
     Args:
         raw: The scene from the reader.

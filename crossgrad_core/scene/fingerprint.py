@@ -199,8 +199,8 @@ def _points_of(scene: Scene) -> PointsMark:
 class Weight(IntEnum):
     """How much a difference affects a model that was trained on the former scene."""
 
-    #: The difference concerns only pixels or points. All cameras are unchanged, and the trained
-    #: parameters stay valid.
+    #: Only pixels or points differ. All cameras are unchanged, and the trained parameters stay
+    #: valid.
     CONTENT = 1
     #: The set of held-out views has changed.
     HELD_OUT = 2
@@ -227,8 +227,8 @@ def differences(was: Fingerprint, now: Fingerprint) -> list[Difference]:
 
     The list is empty if both scenes are equal.
 
-    If the training views change, the local frame and all values in local units change as well. Only
-    the change of the views is then reported.
+    If the training views change, the local frame and all values in local units change as well. In
+    this situation, only the change of the training views is reported.
     """
     changes = _views(was, now)
     if not any(change.weight is Weight.PLACE for change in changes):

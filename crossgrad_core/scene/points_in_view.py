@@ -18,7 +18,8 @@ from crossgrad_core.scene.raw import RawView
 #: must show.
 _TRIED: Final = 1000
 _FEWEST: Final = 0.01
-#: A change of the poses is the likely cause if photos then show at least this share of the points.
+#: If photos show at least this share of the points after a change of the poses, the poses are
+#: probably wrong.
 _REPAIRED: Final = 0.5
 
 _Change: TypeAlias = Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -60,7 +61,7 @@ def check_seen(
 ) -> None:
     """Raise an error if almost no photo shows the points.
 
-    Points and cameras then have different frames.
+    If almost no photo shows the points, points and cameras have different frames.
 
     Args:
         points: The points of the input.

@@ -144,8 +144,8 @@ def _split_by_lists(
     root: Path,
     how: str,
 ) -> Split:
-    # If the input prescribes the split, no list files exist. The message then names the scene's
-    # folder.
+    # If the input prescribes the split, no list files exist. If no list files exist, the message
+    # names the scene's folder.
     places = [root / file if how == "by lists" else root for file in (TRAIN_LIST, TEST_LIST)]
     both = sorted(listed[0] & listed[1])
     if both:

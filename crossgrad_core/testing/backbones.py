@@ -286,8 +286,8 @@ def plain_ones_bake_what_they_draw(make: Make[Backbone]) -> None:
 def _grown(parameters: Parameters) -> Parameters:
     """Change the parameters, so that no value is as special as an initial value.
 
-    All parameters become larger. Colours then stay above 0. Below 0, colours from spherical
-    harmonics are clamped, but plain colours are not.
+    All parameters become larger. With larger parameters, colours stay above 0. Below 0, colours
+    from spherical harmonics are clamped, but plain colours are not.
     """
     rng = np.random.default_rng(5)
 

@@ -58,7 +58,7 @@ def answers_alike(make: Make[Initializer]) -> None:
         one, other = make(), make()
         first, second = one.more_points(scene), other.more_points(scene)
         same_messages = one.messages(scene) == other.messages(scene)
-    require(same_messages, "remarks() returns different notes in two calls")
+    require(same_messages, "messages() returns different texts in two calls")
     require((first is None) == (second is None), "points are added in only one of two calls")
     if first is not None and second is not None:
         for field in fields(first):

@@ -24,7 +24,7 @@ def is_a_finite_scalar_with_a_gradient(make: Make[Loss]) -> None:
             f"the loss has the shape {list(value.shape)}, not the shape of a scalar",
         )
         require(value.isfinite(), f"the loss is {value.item()}")
-        require(gradient.isfinite().all(), "the gradient by the render is not finite")
+        require(gradient.isfinite().all(), "the gradient with respect to the render is not finite")
         require(gradient.any(), "the render receives no gradient from a photo that differs from it")
 
 

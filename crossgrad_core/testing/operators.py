@@ -206,7 +206,10 @@ def same_seed_same_answer(make: Make[Operator]) -> None:
 
 
 def state_survives_a_checkpoint(make: Make[Operator]) -> None:
-    """After each step, the state can be saved and loaded. The next result is then bit-identical."""
+    """After each step, the state can be saved and loaded.
+
+    A run that continues from the saved state gives a bit-identical next result.
+    """
     operator = _matrix_operator(make)
     for views in admitted(operator.views):
         state, copy = PluginState(), PluginState()

@@ -240,7 +240,7 @@ def rows_on_demand_are_asked_for(make: Make[Rasterizer]) -> None:
 def speed_says_where_it_runs(make: Make[Rasterizer]) -> None:
     """`speed` is 0 for devices that the rasterizer does not support.
 
-    `--rasterizer auto` then never selects the rasterizer for such a device.
+    If `speed` is 0, `--rasterizer auto` never selects the rasterizer for the device.
     """
     rasterizer = make()
     for device in ("cpu", "cuda"):

@@ -51,7 +51,7 @@ def decides_the_same_again(make: Make[Recipe]) -> None:
 
 
 def _facts(steps: int) -> Facts:
-    """Return the facts about a run on the sample scene."""
+    """Return the properties of a run of `steps` steps on the sample scene."""
     return facts_of(RunConfig(steps=steps, device="cpu"), sample_scene())
 
 

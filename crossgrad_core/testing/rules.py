@@ -30,7 +30,7 @@ from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.step import final_edits
 
 #: `_STEPS`: number of steps of a run. `_STOP`: the step after which a run is stopped. Weight
-#: averages and learning-rate tails have begun by then.
+#: averages and learning-rate tails begin before the step `_STOP`.
 _STEPS, _STOP = 8, 6
 
 

@@ -74,7 +74,9 @@ def draws_are_training_views(make: Make[Sampler]) -> None:
 
 
 def _require_good(draw: ViewSample, counts: frozenset[int], available: int) -> None:
-    require(isinstance(draw, ViewSample), f"the sampler returns {draw!r}, not a Draw and a state")
+    require(
+        isinstance(draw, ViewSample), f"the sampler returns {draw!r}, not a ViewSample and a state"
+    )
     require(
         isinstance(draw.views, tuple) and all(type(view) is int for view in draw.views),
         f"the drawn views {draw.views!r} are not a tuple of plain integers",

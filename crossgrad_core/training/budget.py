@@ -224,7 +224,7 @@ class Length(Protocol):
 class Planned:
     """A length from a record.
 
-    It is fixed, or revised at the steps at which an earlier run revised it.
+    The length is fixed, or changes at the steps at which it changed in an earlier run.
 
     Args:
         revisions: Pairs of a step and the total number of steps that is valid after this step.

@@ -46,7 +46,8 @@ class Stopper:
 
     Attributes:
         signal: Number of the first signal; None before the first signal.
-        at_once: True after a second signal. Optional work, such as the evaluation, is then skipped.
+        at_once: True after a second signal. If `at_once` is True, optional work, such as the
+            evaluation, is skipped.
         error: Error from outside the training step that ends the run; None without an error.
     """
 

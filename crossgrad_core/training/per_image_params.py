@@ -60,8 +60,8 @@ def read_values(path: Path, like: Mapping[str, Tensor]) -> dict[str, dict[str, T
 
     Args:
         path: The file.
-        like: Name -> [P, ...] parameters of the present run. The file must contain equal names and
-            shapes.
+        like: Name -> [P, ...] parameters of the present run. The file must contain the names and
+            shapes of `like`.
 
     Raises:
         UserError: The file cannot be read, or contains the parameters of another exposure model.
@@ -253,7 +253,7 @@ def take_photo_step(
     held = state.states[STATE]
     tensors = {name: tensor.clone() for name, tensor in held.tensors.items()}
     # Keep the step counts on the CPU. After a checkpoint is loaded, the counts may be on the GPU.
-    # Reading a count in each step would then wait for the GPU.
+    # With the counts on the GPU, reading a count in each step would wait for the GPU.
     tensors[_COUNT] = tensors[_COUNT].cpu()
     rates = {name: parameter.lr.at(progress) for name, parameter in setup.per_photo.items()}
     for row, gradients in _summed(taken).items():

@@ -273,7 +273,7 @@ class Setup:
 
     @cached_property
     def train_views(self) -> tuple[View, ...]:
-        """The training views. Samplers use positions in this tuple as view numbers."""
+        """The training views. Samplers use positions in this tuple as view indices."""
         return self.scene.train_views
 
     @cached_property

@@ -57,9 +57,9 @@ def compiling_beside(setup: Setup) -> Iterator[None]:
     """Compile kernels in a second process, which starts when the first missing kernel is found.
 
     No second process is used on a GPU, on a single core, or if the run uses only one thread. At the
-    end of the block, this process waits for the second process. Then this process loads all kernels
-    for sparse rows. Steps with few and with many rows use different kernels, and the second kind
-    may first occur during training.
+    end of the block, this process waits for the second process. After the wait, this process loads
+    all kernels for sparse rows. Steps with few and with many rows use different kernels, and the
+    second kind may first occur during training.
     """
     alone = setup.config.threads == 1 or available_cores() == 1
     processes: list[subprocess.Popen[bytes]] = []
@@ -163,10 +163,10 @@ def initial_parameters(setup: Setup, rng: np.random.Generator) -> tuple[Paramete
     """Return parameters made from SfM points, from random points, or from a PLY file of Gaussians.
 
     If the points would give more primitives than the user's limit, a random subset of the points is
-    used. The run then starts with the share `BEGINNING` of the limit. Density control can add the
-    remaining primitives in regions that need more primitives. Without density control, the run
-    starts with as many primitives as the limit allows. The Gaussians of a PLY file are used
-    unchanged.
+    used. With such a subset, the run starts with the share `BEGINNING` of the limit. Density
+    control can add the remaining primitives in regions that need more primitives. Without density
+    control, the run starts with as many primitives as the limit allows. The Gaussians of a PLY file
+    are used unchanged.
 
     Returns:
         The parameters, and the number of primitives that all points would give. The number is None

@@ -409,7 +409,7 @@ class Snapshot:
     def restore(self, state: TrainState, seed: int) -> None:
         """Restore `state`, but with new random streams.
 
-        After the rollback, training therefore makes other draws than before.
+        After the rollback, training makes other draws than before.
         """
         state.late.forget()
         state.tensors = self._tensors(state, {n: t.clone() for n, t in self.parameters.items()})
@@ -542,7 +542,7 @@ class RollbackGuard:
         state.touched = False
 
     def commit(self, state: TrainState, *, look: bool = False) -> None:
-        """Record that a step is complete. An error in the next step then does not undo this step.
+        """Record that a step is complete. An error in the next step does not undo a complete step.
 
         Raises:
             NonFiniteError: `look` is True, and a parameter is NaN or infinite.
@@ -580,7 +580,7 @@ class RollbackGuard:
     def restore(self, state: TrainState) -> None:
         """Restore `state` to the end of the last complete step.
 
-        If this is impossible, restore the copy.
+        If the snapshot cannot be restored, restore the copy.
 
         Call this method only at the end of training, because the copy cannot be used again.
         """

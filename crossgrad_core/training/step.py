@@ -317,7 +317,8 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
     """Advance `state` by one training step.
 
     Raises:
-        NonFiniteError: A loss or gradient is not finite. `state` must then not be used any more.
+        NonFiniteError: A loss or gradient is not finite. After this error, `state` must not be used
+            any more.
     """
     regroup_if_due(setup, state)
     state.step += 1

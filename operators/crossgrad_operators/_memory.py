@@ -59,7 +59,7 @@ def _known(kept: torch.Tensor | None, shape: tuple[int, ...]) -> NDArray[np.floa
 def _by_block(context: OperatorContext) -> bool:
     """Return True if each Gramian belongs to its own block.
 
-    There are then few Gramians, and all names differ.
+    If each block has its own Gramian, there are few Gramians, and all names differ.
     """
     blocks = context.blocks
     return len(blocks) <= _BLOCKS and len(set(blocks)) == len(blocks)

@@ -51,5 +51,5 @@ class Anchors(GramianOperator):
 
     @hookimpl
     def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
-        """Return objections to samplers whose views have no labels or other labels."""
+        """Return objections to samplers whose views lack the two labels."""
         return label_objections(selection, {"near": self.near, "far": self.far})

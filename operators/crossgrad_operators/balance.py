@@ -15,8 +15,9 @@ class Aligned(Weighting):
 
     With the eigenvalues L and eigenvectors V of the Gramian, G = V L V^T, the weights are w =
     sqrt(l_min) V L^-1/2 V^T p. Here p = 1/K, and l_min is the smallest eigenvalue above the limit K
-    eps l_max. The result is not continuous at this limit. Below the limit, the direction of an
-    eigenvalue is left out, and l_min becomes the next larger eigenvalue.
+    eps l_max. The result is not continuous where an eigenvalue is at the limit K eps l_max. Below
+    the limit, the direction of an eigenvalue is left out, and l_min becomes the next larger
+    eigenvalue.
 
     Source: Senushkin et al. 2023, "Independent component alignment".
     """

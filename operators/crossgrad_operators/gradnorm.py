@@ -99,7 +99,10 @@ class GradNorm(GramianOperator):
         return followed
 
     def _rates(self, losses: _Losses) -> NDArray[np.float64]:
-        """Return the relative losses l_s [S]. Return ones until every group has an initial loss."""
+        """Return the relative loss l_s of each of the S groups [S].
+
+        Return only ones until every group has an initial loss.
+        """
         newest = [_at(group, group.get("octave", 0), 0.0) for group in losses.values()]
         have_started = all(s["count"] >= self.baseline and s["start"] > 0 for s in newest)
         if not have_started:

@@ -27,7 +27,7 @@ from crossgrad_core.numerics.jobs import parallel
 from crossgrad_core.plugin import Camera, Gaussians
 
 Gradients: TypeAlias = tuple[Tensor | None, ...]
-#: Numbers of the three output networks (opacity, covariance, colour), and number of the covariance
+#: Indices of the three output networks (opacity, covariance, colour), and index of the covariance
 #: network.
 _HEADS, _COVARIANCE = (0, 1, 2), 1
 #: Position of the scales in the list of means, quaternions, scales, opacities and colours.
@@ -39,7 +39,7 @@ class _Back:
     """Sums of gradients over all anchors, and buffers for one stretch (a fixed number of anchors).
 
     Attributes:
-        heads: Numbers of the output networks that receive a gradient. The numbers of these heads
+        heads: Indices of the output networks that receive a gradient. The indices of these heads
             are consecutive.
         features: [Q, F] sum of gradients with respect to the features.
         first: Sums of gradients with respect to the first layers.

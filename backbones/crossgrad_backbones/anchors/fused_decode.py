@@ -87,7 +87,7 @@ class Kept:
         hidden: [A or more, 3 H] hidden layers after the ReLU.
         tanhs: [A, k] opacities before multiplication by the factor.
         spreads: [A, 6] exponentials of the log scales.
-        starts: [A + 1] number of the first Gaussian of each anchor.
+        starts: [A + 1] index of the first Gaussian of each anchor.
         slot: [G] slot of each Gaussian.
         shares: [G, 3] scales divided by the size of the anchor.
         colors: [G, 3] colours.

@@ -151,8 +151,8 @@ def code_of(codes: Tensor, poses: Tensor, camera: Camera, *, training: bool) -> 
     """Return the code [C] of a training view during training. In evaluations, return the mean code.
 
     Scaffold-GS evaluates a held-out view with the code of the training view that has the same
-    index. The held-out view and this training view are unrelated. Here, a held-out view gets the
-    mean code instead.
+    index. The held-out view and this training view are unrelated. crossgrad evaluates a held-out
+    view with the mean code instead.
 
     Args:
         codes: [V, C] codes of the training views.

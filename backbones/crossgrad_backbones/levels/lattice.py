@@ -52,8 +52,8 @@ class Lattice:
         levels: [] number of levels.
         distance: [] standard distance D in local units. At this distance, L* = log_fork(D /
             distance) is 0.
-        lead: [] how many levels above L* a camera uses. `lead` is 0 if L* is rounded down, 1/2 if
-            L* is rounded to the nearest level, and 1 if L* is rounded up.
+        lead: [] number of levels above L* that a camera uses. `lead` is 0 if L* is rounded down,
+            1/2 if L* is rounded to the nearest level, and 1 if L* is rounded up.
         visible_share: [] an anchor is pruned if at most this share of the cameras uses its level.
     """
 
@@ -89,7 +89,7 @@ class Lattice:
         return self.root_cell * self.fork ** (-levels.double())
 
     def coordinates(self, points: Tensor, levels: Tensor) -> Tensor:
-        """Return the coordinates [A, 3] float64 of points [A, 3].
+        """Return the lattice coordinates [A, 3] float64 of points [A, 3].
 
         The unit is a cell of the point's level, and the coordinates start at the origin.
 
@@ -116,7 +116,10 @@ class Lattice:
         return squares.sqrt()
 
     def detail(self, distances: Tensor, extra: Tensor) -> Tensor:
-        """Return L* = log_fork(D / distance) + extra level [A]; infinite for a distance of 0."""
+        """Return the level L* = log_fork(D / distance) + extra level of each anchor [A].
+
+        L* is infinite for a distance of 0.
+        """
         octaves = torch.log2(self.distance.to(distances) / distances)
         return octaves / torch.log2(self.fork) + extra
 
@@ -142,9 +145,9 @@ class Lattice:
     def faded(self, distances: Tensor, levels: Tensor, extra: Tensor) -> Tensor:
         """Return opacity factors [A] in [0, 1] that fade in the finest used level (Octree-GS).
 
-        The factor of the finest used level is the fractional part of L* + 1. No anchor therefore
-        appears or disappears abruptly when the camera moves. Coarser levels and level 0 have a
-        factor of 1.
+        The factor of the finest used level is the fractional part of L* + 1. No anchor appears or
+        disappears abruptly when the camera moves, because this factor is continuous. Coarser levels
+        and level 0 have a factor of 1.
         """
         factor = (self.detail(distances, extra) + 1.0 - levels.to(distances)).clamp(0.0, 1.0)
         return torch.where(levels == 0, torch.ones_like(factor), factor)
@@ -218,8 +221,8 @@ def bounding_range(points: NDArray[np.float64]) -> tuple[float, float]:
 def automatic_root_cell(points: NDArray[np.float64]) -> float:
     """Return four times the median distance between neighbouring points, in local units.
 
-    The result is twice the automatic voxel size of `scaffold`. The most distant cameras then use
-    anchors that are about as dense as the points, for any number of finer levels.
+    The result is twice the automatic voxel size of `scaffold`. For any number of finer levels, the
+    most distant cameras use anchors that are about as dense as the points.
 
     Args:
         points: [P, 3] points in local units.

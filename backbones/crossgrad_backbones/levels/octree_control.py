@@ -182,7 +182,8 @@ class OctreeControl(AnchorDensifier):
     extra_ratio: float = Field(
         0.25,
         ge=0,
-        description="mean gradient above which an anchor gets an extra level, in thresholds",
+        description="an anchor gets an extra level if its mean gradient exceeds this share of the "
+        "threshold",
     )
     extra_level: float = Field(0.01, ge=0, description="amount added to an extra level, levels")
 

@@ -1,8 +1,8 @@
 """Dot products of a few float32 rows in float64; each row is read only once.
 
 Within a call, the compiler may reorder sums to use vector registers. Products of float32 numbers
-are exact in float64. Squares of all float32 magnitudes, from 1e-90 to 1e77, neither underflow nor
-overflow.
+are exact in float64. Squares of float32 numbers are 0 or lie between 1e-90 and 1e77, so that a
+float64 sum of them neither underflows nor overflows.
 """
 
 import numpy as np

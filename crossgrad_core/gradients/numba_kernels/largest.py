@@ -43,8 +43,8 @@ def largest_bits(
         size, first = sizes[tensor], (part - starts[tensor]) * PART
         bits = carray(float32_pointer(addresses[tensor]), size).view(np.uint32)
         part_bits = bits[first : min(size, first + PART)]
-        # Read from four positions at a time. The processor then waits less for memory than with one
-        # position.
+        # Read from four positions at a time. With four positions at a time, the processor waits
+        # less for memory than with one position.
         quarter = len(part_bits) // 4
         p, q = part_bits[:quarter], part_bits[quarter : 2 * quarter]
         r, s = part_bits[2 * quarter : 3 * quarter], part_bits[3 * quarter : 4 * quarter]

@@ -2,8 +2,8 @@
 
 As in `transform.resize`, a Gaussian filter is applied along the columns and then along the rows.
 The result is interpolated linearly. Only the rows that interpolation needs are filtered. A float
-image in the size of the photo is therefore not needed. Every sum uses the order and the rounding of
-SciPy, so that the results are bit-identical.
+image in the size of the photo is not needed. Every sum uses the order and the rounding of SciPy, so
+that the results are bit-identical.
 """
 
 import numpy as np

@@ -58,7 +58,7 @@ class Pairs:
 
 
 class FileNames:
-    """Files below a folder. They can be found by the names that other programs use for them.
+    """Files below a folder. The files can be found by the names that other programs use for them.
 
     A name matches the file with exactly the same path. Without such a file, the name matches the
     file with the same base name and the most similar path. Suffix, letter case and Unicode form may

@@ -216,8 +216,8 @@ def _undecorated(name: str) -> str:
 def with_photo_names(raw: RawScene) -> RawScene:
     """Return the scene with each image named by the path of its photo below `images`.
 
-    Programs may write absolute paths, or paths relative to another folder. If a name differs from
-    the photo only in suffix or letter case, the name is unchanged.
+    Programs may write absolute paths, or paths relative to another folder. A name is unchanged if
+    it differs from the name of its photo only in suffix or letter case.
 
     Raises:
         UserError: The photo folder is missing, or an absolute path matches several photos.

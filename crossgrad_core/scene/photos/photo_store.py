@@ -1,8 +1,9 @@
 """A disk cache of photos in their training size, which all runs share.
 
 Each file of the cache (an entry) contains one photo. The name of an entry is a hash of everything
-that determines the pixels. An entry therefore never changes. An entry is written completely or not
-at all. Each entry contains a checksum. An invalid entry counts as missing.
+that determines the pixels. An entry never changes, because its name is a hash of the inputs. An
+entry is written completely or not at all. Each entry contains a checksum. An invalid entry counts
+as missing.
 """
 
 import logging
@@ -56,7 +57,7 @@ class Storable(Protocol):
     def origin(self) -> str | None:
         """Text with everything that determines the pixels.
 
-        None if reading from the cache would save no time.
+        The text is None if reading from the cache would save no time.
         """
         ...
 

@@ -92,7 +92,7 @@ class PhotoSource:
     def origin(self) -> str | None:
         """Text with everything that determines the pixels.
 
-        None if reading from the cache would save no time.
+        The text is None if reading from the cache would save no time.
         """
         pixels = self.width * self.height * self.reduction**2
         if pixels < _LARGE or (self.target == (self.width, self.height) and not self.distorted):
@@ -188,10 +188,10 @@ class PhotoCache(Generic[Key]):
     """A cache of decoded photos in limited memory. Several threads may use the cache.
 
     Training uses all photos again and again, in changing order. If the photos need slightly more
-    memory than the limit, a least-recently-used cache would almost never contain the next photo.
-    Here, old photos stay in memory. A new photo replaces one of the latest few photos, if possible
-    a photo that is not expected next. If the photos need twice as much memory as the limit, about
-    half of the requests find their photo in memory.
+    memory than the limit, a least-recently-used cache would almost never contain the next photo. In
+    this cache, old photos stay in memory. A new photo replaces one of the latest few photos, if
+    possible a photo that is not expected next. If the photos need twice as much memory as the
+    limit, about half of the requests find their photo in memory.
 
     Args:
         mib: Memory for decoded photos and masks, in MiB. The latest photo is always stored, even if
@@ -230,9 +230,10 @@ class PhotoCache(Generic[Key]):
 
         The photo and the mask are shared, so the caller must not change them.
 
-        If another thread is decoding the photo, this call waits for a short time and then decodes
-        the photo itself. The wait is limited, because the other thread has low priority and may not
-        get a core while other programs run.
+        If another thread is decoding the photo, this call first waits for a short time. If the
+        photo is still missing after the wait, this call decodes the photo itself. The wait is
+        limited, because the other thread has low priority and may not get a core while other
+        programs run.
         """
         over, waited = Event(), False
         while True:

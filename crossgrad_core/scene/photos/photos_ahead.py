@@ -151,7 +151,7 @@ def decode(view: View, *, keep: bool) -> None:
 
 
 def _get_quietly(photo: FilePhoto) -> None:
-    # The training step requests the photo later and then reports the error.
+    # The training step reports the error when it requests the photo later.
     with suppress(Exception):
         photo.cache.get(photo.source)
 
@@ -170,7 +170,7 @@ def _give_way() -> None:
 def fits(scene: Scene, mib: int) -> bool:
     """Return True if all decoded photos of a scene fit into memory.
 
-    Then no photo is decoded twice.
+    If all decoded photos fit into memory, no photo is decoded twice.
     """
     pixels = sum(view.camera.width * view.camera.height for view in scene.views)
     return 4 * pixels <= mib * 2**20  # Three bytes for RGB, and one byte for a mask.

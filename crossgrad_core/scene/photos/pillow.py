@@ -80,8 +80,8 @@ def opened(path: Path, what: str) -> Iterator["Image"]:
 class _Bounded(BufferedReader):
     """A file object that never reads more bytes than the file contains.
 
-    A damaged photo may claim any length of a part. Python's `read` would then allocate this much
-    memory at once.
+    A damaged photo may claim any length of a part. For such a part, Python's `read` would allocate
+    the claimed number of bytes at once.
 
     Args:
         path: Path of the file.
@@ -135,8 +135,8 @@ def _stored_modes(image: "Image") -> list[str]:
 def rows_of(image: "Image", top: int, end: int) -> bytes:
     """Return the pixels in some rows of an opened photo. The photo is decoded if needed."""
     image.load()
-    # Pillow checks its own pixel limit in `crop`, too. Other threads change this limit for a short
-    # time.
+    # Pillow checks its own pixel limit in `crop`, too. Other threads change Pillow's limit for a
+    # short time.
     with _LOCK:
         strip = image.crop((0, top, image.width, end))
     return strip.tobytes()
@@ -165,7 +165,9 @@ def _identified(file: BinaryIO, path: Path) -> "Image":
 
 
 def admit(head: bytes, path: Path) -> bool:
-    """Return True if a file is HEIC or HEIF. Pillow can then open the file.
+    """Return True if a file is HEIC or HEIF.
+
+    For such a file, the function also enables Pillow to open it.
 
     Args:
         head: The first bytes of the file.

@@ -1,8 +1,9 @@
 """Compare the sizes of photos and masks, and choose reduced sizes for photos that are too large.
 
 A JPEG file stores each block of 8 x 8 pixels as 8 x 8 frequencies. For a reduced size, the decoder
-uses only the lowest 4 x 4, 2 x 2 or 1 x 1 frequencies. The full photo is then never in memory.
-Progressive JPEG files need as much memory as before, because their decoder stores all frequencies.
+uses only the lowest 4 x 4, 2 x 2 or 1 x 1 frequencies. With fewer frequencies, the full photo is
+never in memory. Progressive JPEG files need as much memory as before, because their decoder stores
+all frequencies.
 """
 
 from pathlib import Path

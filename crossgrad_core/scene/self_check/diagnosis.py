@@ -113,8 +113,8 @@ class Search:
     """A change with one or two unknown numbers, for example a factor of the focal length.
 
     Attributes:
-        values: [N, D] the combinations of D numbers that are tried first.
-        step: Distance between neighbouring combinations.
+        values: [N, D] the N combinations of D numbers that are tried first.
+        step: Distance between neighbouring combinations in `values`.
         trial: Function that makes a trial from D numbers.
     """
 

@@ -281,7 +281,7 @@ def observed(scene: Scene, views: Integers, pixels: Pixels) -> Evidence:
 
     Args:
         scene: The scene.
-        views: Numbers of the views in the scene.
+        views: Indices of the views in the scene.
         pixels: Function that decodes the photo of a view.
     """
     rank = np.random.default_rng(0).permutation(len(scene.points))
@@ -300,7 +300,7 @@ def tested(scene: Scene, views: Integers, pixels: Pixels, most: int) -> Evidence
 
     Args:
         scene: The scene.
-        views: Numbers of the views in the scene.
+        views: Indices of the views in the scene.
         pixels: Function that decodes the photo of a view.
         most: Largest number of points, summed over all views.
     """

@@ -72,7 +72,7 @@ class Cause:
     """The reason why some photos disagree with the points.
 
     Attributes:
-        views: Numbers of the photos that disagree.
+        views: Indices of the photos that disagree.
         what: Description of the cause.
         todo: The remedy that is suggested to the user.
     """
@@ -124,7 +124,7 @@ def verdict_of(scene: Scene, views: Sequence[int], pixels: Pixels) -> Verdict:
 
     Args:
         scene: The scene.
-        views: Numbers of the views in the scene.
+        views: Indices of the views in the scene.
         pixels: Function that decodes the photo of a view.
 
     Raises:
@@ -154,10 +154,10 @@ class _Group:
 
     Attributes:
         evidence: The cameras, points and photos to compare.
-        views: [V] numbers of the views in the scene.
+        views: [V] indices of the views in the scene.
         agreement: How well the photos agree with the points without any change.
-        recolored: True if the colours of the points contain no information. Colours from other
-            photos then replace the colours of the points.
+        recolored: True if the colours of the points contain no information. If this is True,
+            colours from other photos replace the colours of the points.
     """
 
     evidence: Evidence

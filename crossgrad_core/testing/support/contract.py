@@ -51,7 +51,10 @@ def require(holds: object, otherwise: str) -> None:
 
 
 def cannot_tell(reason: str) -> SkipTest:
-    """Return the exception for a check that does not apply. pytest then reports a skipped check."""
+    """Return the exception for a check that does not apply.
+
+    With this exception, pytest reports a skipped check.
+    """
     return SkipTest(reason)
 
 

@@ -22,7 +22,7 @@ from crossgrad_core.testing.support.contract import require
 #: size.
 _FEW = 16
 #: Number of steps in each of the three windows of the second test. A state that covers fewer recent
-#: steps has stopped growing by then.
+#: steps than this has already stopped growing.
 _WINDOW = 1000
 
 
@@ -103,7 +103,7 @@ def _tensors() -> int:
     gc.collect()
     storages = {}
     for candidate in gc.get_objects():
-        # Do not use `isinstance`, because some objects then emit warnings.
+        # Do not use `isinstance`, because `isinstance` makes some objects emit warnings.
         if issubclass(type(candidate), Tensor) and not candidate.is_sparse:
             storage = candidate.untyped_storage()
             storages[storage.data_ptr()] = storage.nbytes()

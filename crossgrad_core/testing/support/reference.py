@@ -133,8 +133,8 @@ def _options() -> Iterator[_Case]:
     yield _Case("option max_alpha = 0.5", opaque, options={"max_alpha": 0.5})
     yield _Case("option dilation = 2", gaussians, options={"dilation": 2.0})
     depths = _depths(gaussians, camera).sort().values
-    # Choose the depth in the middle of the widest gap between Gaussians. Rounding then cannot move
-    # a Gaussian across the near plane.
+    # Choose the depth in the middle of the widest gap between Gaussians. At this depth, rounding
+    # cannot move a Gaussian across the near plane.
     inner = slice(len(depths) // 4, 3 * len(depths) // 4)
     gaps = depths.diff()[inner]
     widest = int(gaps.argmax()) + len(depths) // 4

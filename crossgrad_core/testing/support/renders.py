@@ -73,11 +73,11 @@ def parameters_in_a_run(parameters: Mapping[str, Tensor]) -> Mapping[str, Tensor
 
 
 def gaussians_in_a_run(gaussians: Gaussians, backbone: Backbone) -> Gaussians:
-    """Return the Gaussians as in a run.
+    """Return the Gaussians in the form that a training run uses.
 
     Tensors that the backbone passes through have on-demand rows.
 
-    Here, all rows are up to date, so that a request for rows does nothing.
+    In the returned Gaussians, all rows are up to date, so that a request for rows does nothing.
     """
     fields = frozenset(f for f in backbone.passthrough if getattr(gaussians, f) is not None)
     return replace(gaussians, on_demand=OnDemand(fields, lambda _: None)).whole()

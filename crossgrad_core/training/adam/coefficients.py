@@ -10,8 +10,8 @@ TINY = 1e-30
 
 
 # Second moments below float32's smallest normal number count as 0, because subnormal numbers are
-# slow on most processors. The square root of this limit is 1e-19, which is negligible compared with
-# eps = 1e-15.
+# slow on most processors. The square root of the smallest normal number is 1e-19, which is
+# negligible compared with eps = 1e-15.
 SMALLEST_NORMAL = 2.0**-126
 
 

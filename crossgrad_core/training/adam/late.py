@@ -2,8 +2,8 @@
 
 A row that was not rendered has a gradient of zero, but Adam still moves the row by its decaying
 moments. The deferred steps of a row are applied when the row is next rendered, or when the whole
-tensor is read. Deferred steps use the float32 operations of immediate steps, in the same order. The
-results are therefore bit-identical.
+tensor is read. Deferred steps use the float32 operations of immediate steps, in the same order.
+Deferred and immediate steps therefore give bit-identical results.
 
 Steps run in background threads while the calling thread continues with serial work. Code that reads
 the tensor waits until the step is complete.
@@ -96,7 +96,7 @@ class Late:
         """
         for tensor_name in [name] if name is not None else list(self._under_way):
             if (begun := self._under_way.get(tensor_name)) is not None:
-                # If the step failed, `end` raises its error. The step then stays in the table, so
+                # If the step failed, `end` raises its error. The failed step stays in the table, so
                 # that the next call raises the error again.
                 begun.end()
                 del self._under_way[tensor_name]
@@ -160,8 +160,8 @@ class Late:
             name: Name of the tensor.
             param: The tensor.
             adam: Moments and step counts.
-            rows: [R] int32 row numbers without duplicates. None means all rows; then no step
-                remains deferred.
+            rows: [R] int32 row numbers without duplicates. If `rows` is None, all rows are updated,
+                and no step remains deferred.
         """
         self.finish(name)
         behind = self._behind.get(name)

@@ -111,8 +111,8 @@ def _add_solution(
 
     The l_i are the eigenvalues, and r is the right-hand side.
 
-    An eigenvector is skipped if the terms of x_i.r cancel up to the share `least`. The eigenvector
-    is then orthogonal to r, except for rounding noise.
+    An eigenvector x_i is skipped if |x_i.r| is at most `least` times the sum of the magnitudes of
+    its terms. A skipped eigenvector is orthogonal to r, except for rounding noise.
     """
     for i in chosen:
         inner = products(vectors[:, i], right, 0, len(v), exact)
@@ -207,8 +207,8 @@ def _same_shares(
         sizes += abs(v[i, 0])
         largest = max(largest, abs(v[i, 0]))
         put(x, i, product(at(v, i), at(scaled, i), exact))
-    # The sum of v, or the weighted sum of the gradients, may be only rounding noise. Then all
-    # weights stay zero.
+    # The sum of v, or the weighted sum of the gradients, may be only rounding noise. If one of
+    # these sums is only rounding noise, all weights stay zero.
     if total[0] * total[0] > CANCELLED * largest * largest and not cancels(x, cosines, exact):
         for i in range(n):
             weights[places[i]] = quotient(at(v, i), total, exact)[0]

@@ -77,7 +77,7 @@ def solve_shifted(matrix: Floats, right: Floats, out: Floats) -> None:
     """Solve (1 + M) x = r by Cholesky factorization, for a positive semi-definite matrix M.
 
     The pivots of 1 + M are at least 1. If rounding makes a pivot smaller, M is so large that the
-    summand 1 does not matter. The pivot is then set to 1. x is still finite and, because the factor
+    summand 1 does not matter. Such a pivot is set to 1. x is still finite and, because the factor
     is regular, a descent direction.
 
     Args:
@@ -138,7 +138,7 @@ def smallest_pivot(cosines: Floats, count: int) -> float:
 def _rotation(one: Pair, other: Pair, between: Pair, exact: Exact) -> tuple[Pair, Pair, Pair]:
     """Return tangent, cosine and sine of the rotation that clears an off-diagonal element."""
     theta = quotient(minus(other, one, exact), product((2.0, 0.0), between, exact), exact)
-    # Above this limit, theta^2 overflows, or adding 1 to theta^2 has no effect.
+    # If theta is above this limit, theta^2 overflows, or adding 1 to theta^2 has no effect.
     far = 1e150 if exact is None else 1e17
     if abs(theta[0]) > far:
         t = quotient((0.5, 0.0), theta, exact)

@@ -85,7 +85,7 @@ class Polyhedron(NamedTuple):
         centre: [K] multipliers of the previous round, towards which the ridge pulls.
         active: [K] True if a constraint is active, so that its multiplier may be positive.
         barred: [K] True if a constraint must stay inactive because of rounding.
-        chosen: [K] numbers of the active constraints, at the start of the array.
+        chosen: [K] indices of the active constraints, at the start of the array.
         point: [K] coefficients b + y of the present point.
         gradient: [K] gradient C (b + y) - h + ridge (y - centre). If y = centre, the gradient is
             the slack of the constraints.
@@ -290,7 +290,7 @@ def approach(problem: Polyhedron) -> int:
 def is_settled(problem: Polyhedron) -> bool:
     """Return True if the ridge has no visible effect.
 
-    The active directions are then not nearly dependent.
+    The ridge has no visible effect if the active directions are not nearly dependent.
 
     The function also sets `ill_conditioned` if the directions require more digits.
     """

@@ -44,7 +44,7 @@ def _start(v: Pairs, i: int) -> None:
 
 @strict_device
 def _as_row(v: Pairs, norms: Pairs, i: int, row: Floats, exact: Exact) -> None:
-    """Convert coefficients of unit gradients, in units of |g_i|, to coefficients of gradients."""
+    """Convert coefficients of unit gradients, in units of |g_i|, to coefficients of the g_k."""
     for k in range(len(v)):
         if v[k, 0] != 0.0:
             ratio = quotient(at(norms, i), at(norms, k), exact)
@@ -103,8 +103,8 @@ def projected(
         exact: True for 32 digits, None for 16 digits.
     """
     threshold, strength = rule
-    # With a threshold of 0, the rule is continuous. The sign of a cosine near zero then hardly
-    # matters, so that no margin is needed.
+    # With a threshold of 0, the rule is continuous. With a continuous rule, the sign of a cosine
+    # near zero hardly matters, so that no margin is needed.
     margin = 0.0 if threshold == 0.0 else OPPOSITE
     least = plus((threshold, 0.0), (margin, 0.0), exact)
     blocks, views, _ = gramians.shape

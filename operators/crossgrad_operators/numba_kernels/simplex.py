@@ -224,7 +224,7 @@ def _is_beyond_reach(problem: Polyhedron, search: Search) -> bool:
 def _repeats(problem: Polyhedron, before: Flags) -> bool:
     """Return True if the active constraints equal the stored constraints.
 
-    Then store the active constraints.
+    After the comparison, store the active constraints.
     """
     same = True
     for k in range(before.size):
@@ -287,8 +287,8 @@ def _defined(problem: Polyhedron, search: Search) -> float:
     """Return the share of CAGrad's direction that is well defined. The multipliers are not changed.
 
     The direction is undefined if 0 is a convex combination of the gradients and the point of level
-    0 is within the distance rho. No level above 0 can then be reached, and many directions are
-    equally good.
+    0 is within the distance rho. In this situation, no level above 0 can be reached, and many
+    directions are equally good.
     """
     largest, rho = 0.0, search.rho[0][0]
     for k in range(len(search.r)):
@@ -377,8 +377,8 @@ def _set_out(problem: Polyhedron, norms: Pairs, q: Pairs, c: float) -> Search:
 def _cagrad_many(problem: Polyhedron, norms: Pairs, q: Pairs, c: float, result: Floats) -> None:
     """Write the weights [K] of two or more gradients to `result`. The array q is working memory.
 
-    If the mean or some convex combination of the gradients is zero, the direction is undefined. The
-    result is then zero.
+    If the mean or some convex combination of the gradients is zero, the direction is undefined. If
+    the direction is undefined, the result is zero.
     """
     exact, views = problem.rounding.exact, len(norms)
     search = _set_out(problem, norms, q, c)

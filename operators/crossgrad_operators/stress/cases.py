@@ -18,11 +18,11 @@ EXACT = 10_000
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """K gradients with P = H + R * Q elements.
+    """K gradients with H + R * Q elements.
 
-    A head of H elements is followed by R copies of a pattern of Q elements.
+    A gradient starts with a head of H elements, followed by R copies of a pattern of Q elements.
 
-    Gramians are sums over elements. Gramians can therefore be computed exactly for any P.
+    A Gramian is a sum over elements. Gramians can therefore be computed exactly even for large R.
 
     Attributes:
         name: Name of the case in the table.
@@ -30,7 +30,7 @@ class Case:
         pattern: [K, Q] float64 values of the pattern.
         copies: Number of copies R.
         dtype: Type of the gradients. The head and the pattern are rounded to this type.
-        absent: Numbers of the views that do not touch the block.
+        absent: Indices of the views that do not touch the block.
     """
 
     name: str

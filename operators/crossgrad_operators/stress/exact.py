@@ -143,8 +143,8 @@ def complementary(matrix: Matrix, offset: Sequence[Number]) -> Vector | None:
 
     The function uses the active-set method of Lawson and Hanson, and checks the result. In each
     step, the most violated constraint becomes active. If the column of this constraint is a
-    combination of active columns, an active constraint is removed first. M may therefore be
-    singular. If no solution exists, the function returns None.
+    combination of active columns, an active constraint is removed first. M may be singular, because
+    dependent columns are never active together. If no solution exists, the function returns None.
     """
     mp = require_mpmath().mp
     x = [mp.mpf(0)] * len(matrix)
@@ -174,8 +174,8 @@ def _settle(
     while active:
         target = solve(matrix, sorted(active), [-o for o in offset])
         if target is None:
-            # The new column is a combination of the other active columns. x can therefore move
-            # along a null vector.
+            # x can move along a null vector, because the new column is a combination of the other
+            # active columns.
             rest = sorted(active - {entered})
             along = solve(matrix, rest, [-row[entered] for row in matrix])
             if along is None or all(v >= 0 for v in along):

@@ -34,7 +34,7 @@ class Question:
 
     Attributes:
         gramian: [n][n] exact Gramian of the n views that have a gradient.
-        places: [n] numbers of these views among all K views.
+        places: [n] indices of these views among all K views.
         views: Number of views K.
         options: Options of the operator.
         labels: [n] labels of the groups of the views.

@@ -3,7 +3,7 @@
 Inside this set, the relative error is at most `PROMISED` u kappa. Here u is the unit roundoff of
 the gradients' type, and kappa = max |w_k| |g_k| / |result|. Outside the set, the result is finite.
 The length of the result is at most a stated factor times the longest gradient. A test checks that
-docs/operators.md contains the texts of this file.
+docs/operators.md lists every operator and its factor.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -221,18 +221,18 @@ class Promise:
 
 #: Guarantee of operators for which no other guarantee is listed.
 ALL: Final = Promise("all gradients", "infinity", lambda _views: float("inf"), everywhere)
-_DETERMINED: Final = "all Gramians with kappa u <= 0.1, and those whose exact result is zero"
+_DETERMINED: Final = "all Gramians with kappa u <= 0.1, and all Gramians whose exact result is zero"
 _CLEAR: Final = (
-    "of these, those whose directions depend on each other exactly or not nearly: no pivot of the "
-    "cosines' Cholesky factor (50 digits, largest first), and no 1 - cos^2 of a pair, lies between "
+    f"{_DETERMINED}, except Gramians with nearly dependent directions: a pivot of the Cholesky "
+    "factorization of the cosines (50 digits, largest first), or 1 - cos^2 of a pair, lies between "
     "1e-29 and 1e-13"
 )
 _REGULAR: Final = (
-    "of these, those of up to two views, and those with no pivot of the cosines' Cholesky factor "
-    "between 1e-29 and 1e-8"
+    f"{_DETERMINED}, except Gramians of more than two views with a pivot of the Cholesky "
+    "factorization of the cosines between 1e-29 and 1e-8"
 )
 _COMPARABLE: Final = (
-    f"{_CLEAR}; and where a convex combination of the directions vanishes, the longest gradient is "
+    f"{_CLEAR}. If a convex combination of the directions vanishes, the longest gradient must be "
     "at most 1e8 times the shortest"
 )
 

@@ -2,8 +2,8 @@
 
 The operators use active sets in float64, and add a ridge to the cosine matrix. The oracles use
 active sets without a ridge. Every result is checked against the optimality conditions. Only the
-minimum meets these conditions. If gradients are linearly dependent, the weights are not unique. The
-oracles then return weights of independent gradients.
+minimum meets these conditions. If gradients are linearly dependent, the weights are not unique. For
+linearly dependent gradients, the oracles return weights of independent gradients.
 """
 
 from collections.abc import Sequence
@@ -302,8 +302,8 @@ def _as_far_as(cosine: Matrix, base: Vector, r: Vector, rho: Number) -> Vector |
 
     The level is the one for which the distance is rho.
 
-    Return None if 0 is a convex combination and level 0 is reached within this distance. No level
-    above 0 can then be reached, and the direction is undefined.
+    Return None if 0 is a convex combination and level 0 is reached within this distance. In this
+    situation, no level above 0 can be reached, and the direction is undefined.
     """
     q = apply(cosine, base)
     x = shortest(cosine, r)

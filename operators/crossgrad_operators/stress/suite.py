@@ -28,11 +28,12 @@ _UNIT = 2.0**-24
 COLUMNS = 5
 _NAME, _CELL = 24, 16
 LEGEND = (
-    "Each cell: relative error in units of u kappa (8 is promised) and microseconds.\n"
-    "u: unit roundoff of the gradients' type; kappa = max |w_k| |g_k| / |u|, at least 1.\n"
-    "~ kappa u > 0.1, finite is all that is promised; * outside the operator's set\n"
-    "(docs/operators.md): finite and not too long; - K is refused; FAIL see below.\n"
-    "Without an error: no reference; finite, and the laws at the end hold."
+    "Each cell: relative error in units of u kappa (at most 8 is guaranteed), and microseconds.\n"
+    "u: unit roundoff of the gradients' type. kappa: max |w_k| |g_k| / |result|, at least 1.\n"
+    "~ kappa u > 0.1: the result is only guaranteed to be finite.\n"
+    "* outside the operator's set (docs/operators.md): the result is finite and not too long.\n"
+    "- the operator refuses this number of gradients. FAIL: the failures are listed at the end.\n"
+    "A cell without an error has no reference: the result is finite and the laws hold."
 )
 
 

@@ -20,8 +20,8 @@ from crossgrad_operators.stress.oracles import cosines, lengths
 from crossgrad_operators.stress.promises import ALL, Facts, Promise
 from crossgrad_operators.stress.reference import Answer
 
-#: If kappa u is above this value, the gradients do not determine the result. Only a finite result
-#: is then guaranteed.
+#: If kappa u is above this value, the gradients do not determine the result. For a larger kappa u,
+#: only a finite result is guaranteed.
 UNDETERMINED: Final = 0.1
 #: Reason of a failure if a result contains NaN or infinity.
 NOT_FINITE: Final = "not finite"

@@ -128,7 +128,7 @@ class NewAnchors:
     def and_more(self, more: "NewAnchors") -> "NewAnchors":
         """Append anchors.
 
-        The present and the appended anchors must contain equal names in `further`.
+        The present and the appended anchors must have the same names in `further`.
         """
         return NewAnchors(
             torch.cat([self.positions, more.positions]),

@@ -1,9 +1,10 @@
 """Kernels that prepare the inputs of the networks and convert their outputs to Gaussians.
 
-All arrays are in C order. A is the number of visible anchors, k of slots, P of all anchors, and G
-of Gaussians with positive opacity. A kernel processes a stretch of n anchors from number `first`
-on. Raw outputs exist only for this stretch. The anchors are divided into jobs of a fixed number of
-anchors. Every job writes its own rows. The bits therefore do not depend on the number of threads.
+All arrays are in C order. A is the number of visible anchors, and P is the number of all anchors.
+Each anchor has k slots. G is the number of Gaussians with positive opacity. A kernel processes a
+stretch of n anchors from number `first` on. Raw outputs exist only for this stretch. The anchors
+are divided into jobs of a fixed number of anchors. Every job writes its own rows. The bits do not
+depend on the number of threads, because every job writes its own rows.
 """
 
 from typing import TypeAlias
@@ -71,7 +72,7 @@ def rectify_back(
 
 @kernel
 def count(opacities: _Floats, starts: _Ints) -> None:
-    """Write `starts` [A + 1], the number of the first Gaussian of each anchor.
+    """Write `starts` [A + 1], the index of the first Gaussian of each anchor.
 
     The opacities are [A, k].
     """
@@ -117,7 +118,7 @@ def gather(
         offsets: [P, k, 3] offsets of all anchors.
         spreads: [A, 6] factors of the offsets, then sizes of the Gaussians.
         rows: [A] row of each visible anchor.
-        starts: [A + 1] number of the first Gaussian of each anchor, from `count`.
+        starts: [A + 1] index of the first Gaussian of each anchor, from `count`.
         origin: [G] output, row of the anchor.
         slot: [G] output, slot of the anchor.
         out_means: [G, 3] output.
@@ -179,7 +180,7 @@ def scatter(
         first: Number of the first anchor.
         anchors: Number of anchors n.
         rows: [A] row of each visible anchor.
-        starts: [A + 1] number of the first Gaussian of each anchor.
+        starts: [A + 1] index of the first Gaussian of each anchor.
         slot: [G] slot of each Gaussian.
         spreads: [A, 6] exponentials of the log scales.
         shares: [G, 3] scales divided by the size of the anchor.

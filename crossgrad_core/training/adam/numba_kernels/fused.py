@@ -80,8 +80,8 @@ def _update_chunks(
             tensor.
         sizes: [T] number of elements of each tensor.
         numbers: [T, 9] coefficients of each tensor's step.
-        from_zero: [T], True if a tensor is uninitialised. The kernel then sets the values to zero
-            before the step.
+        from_zero: [T], True if a tensor is uninitialised. Before the step, the kernel sets the
+            values of uninitialised tensors to zero.
     """
     chunks = 0
     for size in sizes:

@@ -5,8 +5,8 @@ a step changes parameter p, first moment m and second moment v:
 
     m = beta1 m,   v = beta2 v,   p -= step_size * (m / (sqrt(v) * root_scale + eps))
 
-Small values of m and v become 0, as described in `coefficients`. Eight elements take all their
-steps in registers, so that their memory is read and written only once.
+Small values of the moments m and v become 0, as described in `coefficients`. Eight elements take
+all their steps in registers, so that their memory is read and written only once.
 """
 
 import numpy as np

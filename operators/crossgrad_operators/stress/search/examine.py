@@ -72,9 +72,9 @@ def _from_laws(subject: Subject, batch: Batch, outputs: Floats) -> list[float] |
 def largest_jump(
     subject: Subject, batch: Batch, rng: np.random.Generator
 ) -> tuple[int, float] | None:
-    """Return the case whose result changes most if its gradients change by 1e-12.
+    """Return the case whose result changes most after a relative change of 1e-12 in its gradients.
 
-    The largest change is returned, too.
+    Also return the largest change.
 
     The change is divided by the length of the longest gradient. Cases in which the operator is not
     continuous are skipped. If all candidates are skipped, the function returns None. The gradients

@@ -27,12 +27,15 @@ _HEAD = (
     f"{'|u|':>10}{'jump':>10}{'infinite':>9}{'unproven':>9}{'broken':>8}"
 )
 LEGEND = (
-    "outside: share outside the operator's set (docs/operators.md); usual: the same of gradients\n"
-    "  with K 2 to 20 (mostly few), P 1 to 50, norms over seven decades; 1 % of these is allowed.\n"
-    "error: the worst inside the set, in units of u kappa; |u|: the longest outside it, over the\n"
-    "  longest gradient; jump: how far a result moves, over the longest gradient, where gradients\n"
-    "  move by 1e-12 of themselves and the method is continuous.\n"
-    "infinite: results that are not finite; unproven: cases without a proven 50-digit answer."
+    "outside: share of the matrices that are outside the operator's set (docs/operators.md).\n"
+    "usual: share of the ordinary matrices that are outside the set. At most 1 % is allowed.\n"
+    "  Ordinary matrices have K = 2 to 20, P = 1 to 50, and norms over seven decades.\n"
+    "error: largest error inside the set, in units of u kappa.\n"
+    "|u|: longest result outside the set, divided by the longest gradient.\n"
+    "jump: largest change of a result, divided by the length of the longest gradient, after all\n"
+    "  gradient elements change by a factor near 1 + 1e-12, where the method is continuous.\n"
+    "infinite: results that are not finite.\n"
+    "unproven: matrices for which no 50-digit reference was proven."
 )
 
 
@@ -109,5 +112,5 @@ def _failures(tallies: Sequence[WorstCases]) -> str:
         if _too_often_outside(tally)
     ]
     if not lines:
-        return "nothing outside what is stated"
-    return "\n".join(["broken promises:", *lines])
+        return "no broken guarantee"
+    return "\n".join(["broken guarantees:", *lines])

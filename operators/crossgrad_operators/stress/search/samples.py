@@ -72,7 +72,8 @@ def mutants(rng: np.random.Generator, parents: Sequence[Sample], admitted: ViewC
         rows = reshaped if admitted.admits(len(reshaped)) else rows
     batch = np.repeat(rows[None], cases_of(len(rows)), axis=0)
     pieces = np.array_split(batch, len(MUTATIONS))
-    # The order of the mutations is random, because the last pieces of a small batch are empty.
+    # The order of the mutations is random, because a small batch has fewer cases than there are
+    # mutations.
     order = rng.permutation(len(MUTATIONS)).tolist()
     variants = [
         MUTATIONS[mutation](rng, piece) for mutation, piece in zip(order, pieces, strict=True)
