@@ -13,7 +13,7 @@ from crossgrad_backbones.visibility import NEAR
 from crossgrad_core.plugin import Camera, Gaussians, Phase, Response
 
 #: Variance of a box of one pixel, in px^2. Integrating a Gaussian over a pixel adds this variance
-#: to its variance.
+#: to the variance of the Gaussian.
 PIXEL_VARIANCE = 1.0 / 12.0
 
 

@@ -24,9 +24,9 @@ def as_plain(
 
     The response adds the variance `blur` to the 2-D covariance S, and keeps opacity times sqrt(det
     S) constant. A 3DGS viewer adds a larger variance, the dilation. The difference between the
-    dilation of the viewer and `blur` is therefore first subtracted from the 3-D variances. For
-    this, a pixel at depth z has the width z / f in local units, with the focal length f. S' is the
-    2-D covariance after the subtraction. The opacity is multiplied by sqrt(det S / det(S' +
+    dilation of the viewer and `blur` is therefore first subtracted from the 3-D variances. For the
+    subtraction, a pixel at depth z has the width z / f in local units, with the focal length f. S'
+    is the 2-D covariance after the subtraction. The opacity is multiplied by sqrt(det S / det(S' +
     dilation)), the ratio of the footprints.
 
     The 3-D variances are computed for the camera with the smallest pixels at the Gaussian. The

@@ -86,7 +86,7 @@ def smoothed(log_scales: Tensor, logits: Tensor, widths: Tensor) -> tuple[Tensor
 
 
 class _Smoothed(torch.autograd.Function):
-    """The filter with a backward pass.
+    """The 3-D filter with its backward pass.
 
     With S = hypot(s, w) and k = s / S, the derivatives are dS/d(log s) = S k^2 and d(log prod
     k)/d(log s) = (w / S)^2.
@@ -180,7 +180,7 @@ class MipSplatting(Vanilla):
 
     @hookimpl
     def crossgrad_after_step(self, context: AfterStepContext) -> DensifyResult | None:
-        """Compute the filter again after steps without an edit, if this is due."""
+        """Compute the filter again in the steps without an edit that `renews` chooses."""
         if context.edited or not renews(context.schedule, context.step):
             return None
         widths = self._widths(context.parameters, context.scene)
@@ -218,8 +218,8 @@ class MipSplatting(Vanilla):
 def renews(schedule: Schedule, step: int) -> bool:
     """Return True if the filter is computed again after a step without an edit.
 
-    As published, this happens every 100 of 30,000 steps, from the end of density control until 100
-    steps before the end of the run.
+    As published, the filter is computed again every 100 of 30,000 steps, from the end of density
+    control until 100 steps before the end of the run.
     """
     every = max(1, schedule.lr_until // 300)
     last = schedule.counted(schedule.total) - every

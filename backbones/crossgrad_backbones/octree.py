@@ -74,7 +74,7 @@ def init_anchors(points: NDArray[np.float64], lattice: Lattice, *, everywhere: b
     Initial scales come from the distances between sites of the same level, including sites without
     an anchor. The published code uses distances to anchors of any level. With these distances,
     coarse anchors start as small as neighbouring fine anchors. A distant camera uses only coarse
-    anchors. With such small Gaussians, its image would show gaps.
+    anchors. With such small Gaussians, the image of a distant camera would show gaps.
 
     Args:
         points: [P, 3] points in local units.

@@ -111,7 +111,8 @@ class DeferredSums(Gradients):
     def _read(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Two arrays [B, K] with an element for each block and view.
 
-        The first is True for finite gradients, the second for finite non-zero gradients.
+        The first array is True for finite gradients, the second array for finite non-zero
+        gradients.
         """
         magnitudes = [size for view in self._largest for size in view.values()]
         values = iter(torch.stack(magnitudes).tolist() if magnitudes else ())

@@ -32,7 +32,7 @@ def is_finite(tensor: Tensor) -> bool:
 def finite_and_present(tensor: Tensor | None) -> tuple[bool, bool]:
     """Return whether all elements are finite, and whether any element is not 0.
 
-    Return (True, False) for None.
+    For None instead of a tensor, return (True, False).
     """
     return all_finite_and_present([tensor])[0]
 

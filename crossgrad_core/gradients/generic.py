@@ -46,7 +46,7 @@ def combine(
     The sum is computed in float64 in the given order, and rounded once.
 
     Args:
-        column: The gradients of K views; None is left out.
+        column: The gradients of K views; None (a missing gradient) is left out.
         weights: [K] weight of each gradient.
         plain: True to add the gradients without weights, in their own type.
         out: Tensor for the result, which may be one of the gradients.

@@ -80,7 +80,7 @@ def combine(
         weights: [T, K] weight of each gradient.
         plain: [T], True for columns that are added without weights, in float32 and in the order of
             the views.
-        out: T tensors for the results. Each of them may be a gradient of its column.
+        out: T tensors for the results. Each output may be a gradient of its column.
         divisor: Number by which plain sums are divided, in float32.
     """
     from crossgrad_core.gradients.numba_kernels import dense

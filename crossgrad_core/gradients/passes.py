@@ -68,7 +68,7 @@ def column_remainders(
 ) -> NDArray[np.float64]:
     """Return [B, K, K], the rounding residuals of `gramians`.
 
-    Each of these Gramians is a sum of results of `column_gramians`.
+    Each of the given Gramians is a sum of results of `column_gramians`.
 
     Args:
         columns: T columns of gradients.

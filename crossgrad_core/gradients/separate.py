@@ -40,7 +40,7 @@ class DenseGradients(SeparateGradients):
 
     Sparse gradients stay sparse for sums and for the Gramians of blocks. All other operations
     convert sparse gradients to dense tensors. Gramians are computed in float64. `column_gramians`
-    describes values outside its range.
+    describes how very large and very small gradients are processed.
 
     Args:
         views: For each view: tensor name -> gradient. None or a missing name means that the view

@@ -180,7 +180,7 @@ class SummedGradients(Gradients):
     def _remember(self) -> None:
         """Record that the sum was checked.
 
-        Do this only for a single view, because a sum of several views may overflow.
+        Record this only for a single view, because a sum of several views may overflow.
         """
         self._looked = {
             name: (gradient, gradient._version)  # noqa: SLF001

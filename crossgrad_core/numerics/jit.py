@@ -35,8 +35,8 @@ def inlined(function: Callable[P, R], **options: Any) -> Callable[P, R]:  # noqa
 
     The code of the function becomes part of the calling kernel.
     """
-    # Do not compile wrappers for calls from Python and C. The wrappers would not be used, and would
-    # take a quarter of the compilation time.
+    # Do not compile wrappers for calls from Python and C. Such wrappers would not be used, and
+    # would take a quarter of the compilation time.
     whole = {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return cast("Callable[P, R]", _COMPILE(**whole, **options, **_OPTIONS)(function))
 

@@ -119,7 +119,8 @@ def emitted(emit: Callable[..., Any], result: Any, *operands: Any) -> Any:
             operands' LLVM values.
         result: Numba type of the result, such as `SIXTEEN`. `_lanes` and `_mask` mean a vector with
             as many lanes as the operands' vectors.
-        operands: Numba types of the operands, also with `_lanes` and `_mask`. None means any array.
+        operands: Numba types of the operands, also with `_lanes` and `_mask`. An operand type of
+            None means any array.
     """
 
     def define(*given: Any) -> Any:
@@ -413,11 +414,13 @@ prefetch: Callable[[_Array, int], None] = emitted(
 prefetch_write: Callable[[_Array, int], None] = emitted(
     lambda at, array, index: _prefetch(at, array, index, write=1), types.void, None, types.intp
 )
-#: Return a b + c. The result is rounded only once if the machine supports this.
+#: Return a b + c. The result is rounded only once if the machine has a fused multiply-add
+#: instruction.
 fma: Callable[[Lanes, Lanes, Lanes], Lanes] = emitted(
     _llvm("llvm.fmuladd"), _lanes, _lanes, _lanes, _lanes
 )
-#: Return c - a b. The result is rounded only once if the machine supports this.
+#: Return c - a b. The result is rounded only once if the machine has a fused multiply-add
+#: instruction.
 fnma: Callable[[Lanes, Lanes, Lanes], Lanes] = emitted(_negated_fma, _lanes, _lanes, _lanes, _lanes)
 #: Return the square root of each lane.
 square_root: Callable[[Lanes], Lanes] = emitted(_llvm("llvm.sqrt"), _lanes, _lanes)
@@ -448,7 +451,8 @@ lowest_bit: Callable[[np.uint64], int] = emitted(
 count_bits: Callable[[np.uint64], int] = emitted(
     _llvm("llvm.ctpop.i64", _LONG), types.int64, types.uint64
 )
-#: Return value * 2^n. The second vector must contain n + 1.5 * 2^23, whose lowest bits are n.
+#: Return value * 2^n. The second vector must contain n + 1.5 * 2^23, because the lowest bits of
+#: this float32 number are n.
 scale_by_power: Callable[[Lanes, Lanes], Lanes] = emitted(_scale_by_power, _lanes, _lanes, _lanes)
 #: Return a vector of eight sums: lane i contains the sum over all lanes of vector i. Lanes are
 #: added in pairs.

@@ -42,7 +42,7 @@ class Bimodality:
 
     @property
     def deciding(self) -> float:
-        """The form for decisions: finite-sample, or plain moments for small samples."""
+        """The form that decisions use: `sample`, but `population` for small samples."""
         return self.sample if self.size >= _SMALLEST_SAMPLE else self.population
 
 

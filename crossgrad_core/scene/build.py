@@ -82,7 +82,7 @@ def _is_blank(source: PhotoSource) -> bool:
 
 
 def _counting_shares(source: PhotoSource) -> list[float]:
-    """Return two shares of the stored pixels: kept by the mask, and kept by transparency."""
+    """Return the shares of the stored pixels that the mask and the transparency mark as valid."""
     shares = [1.0]
     if source.mask is not None:
         shares.append(float((decode_mask(source.mask) > 0).mean()))
@@ -214,8 +214,8 @@ def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
 
     The scene does not include views without a photo, views that no split list contains, and
     training views that are masked completely. The local frame is computed from the training
-    cameras. Nothing is written to disk here. A photo is decoded only if its mask or transparency
-    may hide all of its pixels.
+    cameras. The function writes nothing to disk. A photo is decoded only if its mask or
+    transparency may hide all of its pixels.
 
     Raises:
         UserError: The input cannot be used for training. The message names the cause, the file and
@@ -336,7 +336,7 @@ def _note_regimes(regimes: Sequence[str], train: Sequence[int], how: str) -> str
 def _note_unmeasured(
     regimes: Sequence[str], train: Sequence[int], options: SceneOptions
 ) -> Iterator[str]:
-    """Yield a note about regimes that have no held-out photo, if another regime has one."""
+    """Yield a note about regimes without held-out photos, if another regime has held-out photos."""
     held_out = Counter(regimes) - Counter(regimes[i] for i in train)
     lacking = sorted(set(regimes) - set(held_out))
     if held_out and lacking:

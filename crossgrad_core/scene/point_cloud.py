@@ -204,7 +204,7 @@ def _require_laspy(path: Path) -> None:
 def thinned(points: CheckedPoints, most: int) -> tuple[CheckedPoints, list[str]]:
     """Return at most `most` of the points, and a note.
 
-    Of all points in a cube of a grid, one is kept.
+    Of all points in a cube of a grid, one point is kept.
 
     The kept point is the first point of the cube in the order of the file. Equal files therefore
     give equal points.

@@ -12,8 +12,8 @@ def guard_pycolmap() -> None:
 
     pycolmap 4.2.1 contains its own zlib and exports the symbols of this library. If pycolmap is
     loaded before the system's zlib, Pillow later mixes both libraries, and writing a PNG file
-    aborts the process. To avoid this, zlib is imported first. pycolmap also installs a SIGTERM
-    handler, which ends the process without calling Python's handler. The function therefore
+    aborts the process. To avoid this abort, zlib is imported first. pycolmap also installs a
+    SIGTERM handler, which ends the process without calling Python's handler. The function therefore
     restores the previous handler.
     """
     if "pycolmap" in sys.modules:

@@ -42,7 +42,8 @@ class RawView:
         seen: [S] int64 rows of the points that the view observes; may be empty.
         mask: Path of the mask, if the input names a mask. The option for the mask folder has
             priority.
-        place: Path whose folders determine the regime of the view. None means the path `name`.
+        place: Path whose folders determine the regime of the view. If `place` is None, the path
+            `name` is used.
     """
 
     name: str
@@ -70,8 +71,8 @@ class RawScene:
         notes: Notes about changes that the reader made to the input.
         split: Names of the training and of the held-out views; None if the input prescribes no
             split.
-        background: RGB in [0, 1] behind transparent pixels. None masks all pixels with alpha below
-            one half.
+        background: RGB in [0, 1] behind transparent pixels. If `background` is None, all pixels
+            with alpha below one half are masked.
         files: Paths of the files that the reader used, except photos and masks.
     """
 

@@ -52,9 +52,8 @@ def split_views(
     """Split views as the option `split` requires. At least one view is a training view.
 
     `auto` first uses list files or the split that the input prescribes. A split by folder may hold
-    out fewer than two photos of a regime. Such a split by folder may hold out fewer than two photos
-    of a regime. If a split by regime would hold out two or more, `auto` holds out every n-th photo
-    of each regime instead.
+    out fewer than two photos of a regime. If a split by regime would hold out two or more photos of
+    this regime, `auto` uses the split by regime instead.
 
     Args:
         names: Names of all views that can be used.
@@ -80,9 +79,9 @@ def split_views(
 
 
 def _by_regime(every: Split, names: Sequence[str], options: SceneOptions, label: Label) -> Split:
-    """Return the split by regime if the option requires it or a regime has too few test views.
+    """Return the split by regime if the option requires this split.
 
-    The split by regime is also returned if a regime has too few held-out views.
+    Also return the split by regime if the split `every` has too few held-out views of a regime.
     """
     regimes = label(names)
     stratified = _split_stratified(names, options.test_every, regimes)

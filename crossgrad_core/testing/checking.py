@@ -56,7 +56,8 @@ def check_entry(entry: registry.Entry) -> list[Result]:
         else []
     )
     if taken and entry.slot == COMMANDS:
-        # The core's command is called instead, so the plugin's command cannot be tested.
+        # Users cannot call the plugin's command if the core has a command with this name, so the
+        # command cannot be tested.
         return names
     try:
         loaded = load_command(entry) if entry.slot == COMMANDS else registry.load_entry(entry)

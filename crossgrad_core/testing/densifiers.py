@@ -166,7 +166,7 @@ def _screen(gaussians: int, needs: frozenset[str], seed: tuple[int, int]) -> Scr
 
 
 def _directions(radii: Tensor, gradient: Tensor, rng: np.random.Generator) -> Tensor:
-    """Create up to four pixels in each of the six bins.
+    """Create up to four pixels in each of six direction bins.
 
     The absolute gradients of these pixels sum to twice the absolute value of `gradient`.
     """
@@ -183,8 +183,8 @@ def _directions(radii: Tensor, gradient: Tensor, rng: np.random.Generator) -> Te
 def _backbone_for(densifier: Densifier) -> Backbone:
     """Return a backbone for the densifier.
 
-    If possible, the backbone uses this densifier by default. At least, it has the tensors that the
-    densifier edits.
+    If possible, the backbone uses this densifier by default. In any case, the backbone has the
+    tensors that the densifier edits.
     """
     fitting = []
     # If several backbones are suitable, the first one is used. Backbones of crossgrad precede the
@@ -275,7 +275,7 @@ def never_outgrows_the_room(make: Make[Densifier]) -> None:
 def most_primitives_survive(make: Make[Densifier]) -> None:
     """No edit removes nearly all primitives of a good model.
 
-    Training could not restore nearly all primitives.
+    Training could not replace so many removed primitives.
     """
     run = DensifierRun.of(make())
     for step in range(_EDIT - 4, _EDIT + 1):

@@ -127,7 +127,7 @@ def _hooks(observer: Observer, seconds: dict[str, float] | None = None) -> Itera
     Args:
         observer: The observer.
         seconds: Dictionary that receives the wall time of the fastest call of each hook, by name.
-            None measures no times.
+            If `seconds` is None, no times are measured.
     """
     manager = make_manager({"components": _Components(), "observer": observer})
     if seconds is not None:

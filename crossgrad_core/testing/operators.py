@@ -310,9 +310,6 @@ def what_it_reads_is_declared(make: Make[Operator]) -> None:
 
     The declarations matter: a run refuses a grouping if no component reads labels, and a
     granularity if no component reads Gramians.
-
-    The declarations matter: a run refuses a grouping if no component reads labels, and a
-    granularity if no component reads Gramians.
     """
     operator = _matrix_operator(make)
     for views in admitted(operator.views):

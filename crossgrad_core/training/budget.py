@@ -20,8 +20,8 @@ from crossgrad_core.training.state import ClockKind, TrainState
 #: cost of a step at the start. The value was measured in runs with four edits. During a run,
 #: measured times replace this estimate.
 COST_PER_EDIT = 0.2
-#: Maximum number of edits that increase the estimated cost. Growth slows down after the first
-#: edits.
+#: Maximum number of edits that increase the estimated cost. The number of primitives grows more
+#: slowly after the first edits.
 COUNTED_EDITS = 5
 #: Number of pixels that take as much rendering time as one Gaussian. Source:
 #: `benchmarks/grids/two_views_tuning.yaml`.

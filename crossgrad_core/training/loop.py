@@ -126,7 +126,9 @@ _VIEWS, _STEPS = 8, 2
 
 
 class Prefetcher:
-    """A prefetcher of photos. It predicts the next views, and threads decode their photos.
+    """A prefetcher of photos.
+
+    The prefetcher predicts the next views, and threads decode the photos of these views.
 
     The prefetcher draws the next views with copies of the sampler's random generator and state. The
     prediction only decides which photos are decoded first. The prediction may be wrong if the
@@ -153,7 +155,8 @@ class Prefetcher:
             self._follow(state)
             self._draw(state)
             views = [setup.train_views[index] for draw in self._draws for index in draw]
-        # Ignore the error here. The training step calls the sampler again and reports the error.
+        # Ignore an error of the sampler here. The training step calls the sampler again and reports
+        # the error.
         except Exception:
             self._blind = True
             return

@@ -13,8 +13,8 @@ from crossgrad_core.contract.contexts import ViewRecord
 #: Number of copies of the parameters that always exist: the parameters and their two moments, once
 #: in the training state and once in the snapshot.
 STANDING = 6
-#: During an edit, the new parameters and their two moments also exist. No autograd graph exists at
-#: that time.
+#: During an edit, the new parameters and their two moments also exist. No autograd graph exists
+#: during an edit.
 EDIT = 3
 #: Memory of the autograd graph of one view until its backward pass ends. The unit is the memory of
 #: the parameters or of the view's decoded tensors, whichever is larger. With the numba rasterizer,

@@ -122,7 +122,7 @@ def _misfit(path: Path, exposure: object, expected: str, found: str) -> UserErro
     )
 
 
-#: Key of these parameters in `TrainState.states`.
+#: Key of the exposure parameters in `TrainState.states`.
 STATE = "photos"
 _VALUE, _FIRST, _SECOND, _COUNT = "value", "exp_avg", "exp_avg_sq", "count"
 #: The parameters of one photo, by name; autograd collects their gradients.
@@ -305,7 +305,7 @@ def _check_gradients(
 def _is_finite(tensor: Tensor) -> bool:
     """Return True if the tensor is finite or on a GPU.
 
-    On a GPU, the next loss of the photo shows the error.
+    On a GPU, the values are not checked, because the next loss of the photo shows the error.
     """
     return not tensor.is_cpu or bool(torch.isfinite(tensor).all())
 

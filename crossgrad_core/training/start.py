@@ -90,7 +90,7 @@ def compiling_beside(setup: Setup) -> Iterator[None]:
 def compile_all(loss: ComponentChoice) -> None:
     """Compile the kernels of a loss and of the optimizer.
 
-    For this, they are called with artificial data.
+    To compile the kernels, call the loss and the optimizer with artificial data.
     """
     photo = torch.zeros((64, 64, 3), dtype=torch.uint8)
     render = torch.full((64, 64, 3), 0.5, requires_grad=True)
@@ -105,7 +105,7 @@ def compile_all(loss: ComponentChoice) -> None:
 def compile_rows() -> None:
     """Compile the optimizer kernels for sparse rows.
 
-    For this, they are called with artificial data.
+    To compile the kernels, call the optimizer with artificial data.
     """
     values, state, late = torch.zeros((8, 3)), AdamState(), Late()
     # The three steps call all kernels: one row, another row with deferred steps, and enough rows

@@ -298,7 +298,7 @@ def no_json(value: object) -> str:
 def _odd(value: object, device: str) -> str:
     """Return why a value cannot be stored as a tensor in a file.
 
-    The text is empty if it can be stored.
+    The text is empty if the value can be stored.
     """
     if not isinstance(value, Tensor):
         return f"of type {type(value).__name__}, not a tensor"
@@ -323,7 +323,7 @@ def _no_states(hook: HookCaller, what: str, expected: str, found: object) -> Use
 
 
 class _Current(Mapping[str, Tensor]):
-    """Tensor name -> parameter.
+    """A mapping from the names of tensors to parameters.
 
     Reading a parameter applies its deferred Adam steps first. A copy of this mapping is a plain
     dict.

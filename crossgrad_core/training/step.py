@@ -135,7 +135,7 @@ def observed_views(
 ) -> tuple[ViewRecord, ...]:
     """Return the records of views for density control.
 
-    The records include an extra view if one is due.
+    The records include an extra view in the steps that require one.
 
     Raises:
         NonFiniteError: The loss of the extra view is not finite.
@@ -157,8 +157,8 @@ def observed_views(
     return (*records, observe_view(setup, state, draw, scales_of(setup, state, draw)[0]))
 
 
-#: With fewer Gaussians, sorting in memory does not help. For 2^14 Gaussians with 59 parameters
-#: each, the parameters and moments use 12 MB.
+#: With fewer Gaussians than this number, sorting in memory does not help. For 2^14 Gaussians with
+#: 59 parameters each, the parameters and moments use 12 MB.
 FEWEST_SORTED = 2**14
 #: `_BITS`: bits of each coordinate in a Morton code of 63 bits. `_CELLS`: number of cells per unit
 #: of the local frame. All cameras together span about one unit. Positions more than 128 units from

@@ -209,7 +209,7 @@ def add_regularization(
 ) -> None:
     """Add the gradients of regularization terms to `into`.
 
-    The terms belong to `view`. If `view` is None, they belong to the whole step.
+    The terms belong to `view`. If `view` is None, the terms belong to the whole step.
     """
     context = RegularizeContext(
         **context_fields(setup, state, "regularize"),

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.plugin import OperatorContext, PluginState
 
-#: If there are more Gramians than this, each Gramian belongs to one primitive.
+#: If there are more Gramians than this number, each Gramian belongs to one primitive.
 _BLOCKS = 64
 
 

@@ -66,7 +66,10 @@ def reads_gramians(operators: Iterable[MatrixOperator]) -> bool:
 
 
 def first_grouping(operators: Iterable[MatrixOperator]) -> str | None:
-    """Return the grouping of the first operator that needs a grouping. Return None if none does."""
+    """Return the grouping of the first operator that needs a grouping.
+
+    Return None if no operator needs a grouping.
+    """
     return next(filter(None, (operator.resolved_grouping for operator in operators)), None)
 
 

@@ -13,7 +13,7 @@ from crossgrad_core.plugin import AggregateContext, AggregateResult, Operator, P
 class GradDrop(Operator):
     """In each element, keep at random either the positive or the negative gradients.
 
-    The result is their sum.
+    The result is the sum of the kept gradients.
 
     Let p be the sum of the positive values, and n the sum of the magnitudes of the negative values.
     With probability p / (p + n), the operator keeps the positive gradients, and otherwise the

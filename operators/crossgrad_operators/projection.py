@@ -69,9 +69,9 @@ class Soft(GramianOperator):
     """Remove `strength` times the component along g_j from g_i if cos(g_i, g_j) < -`threshold`.
 
     For the present vector v of view i, v -= strength (v.g_j / |g_j|^2) g_j. With threshold 0 and
-    strength 1, the result equals the operator `symmetric`. With strength 0, it equals `sum`. With a
-    threshold above 0, the result is not continuous in the gradients. Pairs are processed in the
-    order of the views in the step.
+    strength 1, the result equals the operator `symmetric`. With strength 0, the result equals the
+    operator `sum`. With a threshold above 0, the result is not continuous in the gradients. Pairs
+    are processed in the order of the views in the step.
     """
 
     identity_at_one: ClassVar[bool] = True
@@ -140,7 +140,7 @@ def project(
         context: The context, which contains the views that are present and the precision of the
             gradients.
         order: [K, K] order of the other views for each view.
-        gates: [B, K, K] True for pairs that may be projected. None means that all pairs may be
+        gates: [B, K, K] True for pairs that may be projected. If `gates` is None, all pairs may be
             projected.
         threshold: Only cosines below minus this value count as conflicts.
         strength: Share of the conflicting component that is removed.

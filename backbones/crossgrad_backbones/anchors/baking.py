@@ -56,7 +56,9 @@ class ColorFit:
         self.colors[rows] += weighted * (colors[..., None, :] - 0.5)
 
     def solved(self, anchor: Tensor, slot: Tensor) -> Tensor:
-        """Return the coefficients [G, 4, 3] of G slots.
+        """Return the colour coefficients [G, 4, 3] of G slots.
+
+        The coefficients belong to four basis functions and three channels.
 
         Each slot needs at least one weight that is not 0.
         """

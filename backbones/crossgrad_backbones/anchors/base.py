@@ -146,7 +146,7 @@ class AnchorBackbone(AnchorOptions):
     [P, F]; `scales` [P, 6], logarithms of three scales of the offsets and three sizes of Gaussians;
     `mlp_opacity`, `mlp_cov`, `mlp_color` and, if enabled, `mlp_bank`, with four tensors each;
     `voxel_size`, frozen. The published code also stores a rotation and an opacity for each anchor,
-    but never trains these two tensors. Rotations and opacities of anchors are left out here.
+    but never trains these two tensors. crossgrad leaves out the rotations and opacities of anchors.
     Source: Scaffold-GS (Lu et al. 2024).
     """
 
@@ -210,7 +210,7 @@ class AnchorBackbone(AnchorOptions):
     def used(self, parameters: Mapping[str, Tensor], camera: Camera, phase: Phase) -> Used | None:
         """Return the anchors that a camera uses, without a test of its frustum.
 
-        None means all anchors.
+        If the result is None, the camera uses all anchors.
 
         Args:
             parameters: The parameters.

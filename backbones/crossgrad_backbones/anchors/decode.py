@@ -100,7 +100,7 @@ class _Back:
     def by_second(self, inputs: Inputs) -> list[Tensor | None]:
         """Return gradients of weights and biases of the three second layers.
 
-        Unused heads get None.
+        An output network without a gradient gets None.
         """
         gradients: list[Tensor | None] = [None] * (2 * len(_HEADS))
         sizes = [len(inputs.second[head][1]) for head in self.heads]

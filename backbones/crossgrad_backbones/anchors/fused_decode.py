@@ -151,7 +151,7 @@ def array(tensor: Tensor) -> NDArray[Any]:
 def _hidden(inputs: Inputs) -> tuple[Tensor, Tensor]:
     """Return the inputs and hidden layers of the networks.
 
-    Rows of zeros pad both to a multiple of `PANEL`.
+    Rows of zeros pad the inputs and the hidden layers to a multiple of `PANEL` rows.
     """
     weight, bias = inputs.first
     anchors = len(inputs.view.rows)

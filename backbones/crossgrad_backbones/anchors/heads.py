@@ -19,7 +19,7 @@ from crossgrad_core.plugin import Block, BlockKind, Gaussians, LearningRate, Par
 
 #: Number of values of the direction from the camera to an anchor.
 DIRECTION = 3
-#: Numbers of the two linear layers in a network. The ReLU between the linear layers has number 1.
+#: Indices of the two linear layers in a network. The ReLU between the linear layers has index 1.
 LAYERS = (0, 2)
 #: Strides with which the feature bank reads the feature vector, from coarse to fine.
 BANK_STRIDES = (4, 2, 1)

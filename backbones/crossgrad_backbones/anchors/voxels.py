@@ -90,8 +90,8 @@ def free_cells(wanted: Tensor, taken: Tensor) -> tuple[Tensor, Tensor]:
 
     Returns:
         [C] int64: for each distinct empty cell, the first row in `wanted`, sorted by the numbers
-        from `numbered`. [N] int64: for each wanted cell, its position in this list; -1 if the cell
-        is taken.
+        from `numbered`. [N] int64: for each wanted cell, its position in the list of empty cells;
+        -1 if the cell is taken.
     """
     number = numbered(torch.cat([wanted, taken]))
     count = int(number.max()) + 1 if len(number) else 0

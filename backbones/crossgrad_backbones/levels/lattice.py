@@ -50,7 +50,7 @@ class Lattice:
         root_cell: [] edge of a cell at level 0 in local units.
         fork: [] number of cells of the next level along the edge of a cell.
         levels: [] number of levels.
-        distance: [] standard distance D in local units. At this distance, L* = log_fork(D /
+        distance: [] standard distance D in local units. At the distance D, L* = log_fork(D /
             distance) is 0.
         lead: [] number of levels above L* that a camera uses. `lead` is 0 if L* is rounded down,
             1/2 if L* is rounded to the nearest level, and 1 if L* is rounded up.
@@ -135,10 +135,7 @@ class Lattice:
         return (levels == 0) | (distances <= farthest)
 
     def _forks(self, exponents: Tensor) -> Tensor:
-        """Return fork^exponents in the floating-point type of `exponents`.
-
-        Every step computes this value for all anchors.
-        """
+        """Return fork^exponents in the floating-point type of `exponents`."""
         # Do not use exp2, because its rounding depends on the number of threads.
         return torch.exp(torch.log(self.fork) * exponents)
 

@@ -23,7 +23,7 @@ from crossgrad_core.plugin import SHORTEST_ANCHOR_INTERVAL, DensifyContext, Para
 
 @dataclass(frozen=True)
 class Thresholds:
-    """The gradients for which anchors are added, for each level.
+    """The gradient thresholds of all levels.
 
     Attributes:
         base: Smallest gradient norm for which anchors of level 0 request an anchor, in NDC units.

@@ -57,7 +57,7 @@ def row(address: int, start: int, length: int) -> NDArray[np.float32]:
 def _many_dots(rows: Ints, count: int, start: int, length: int, out: Floats) -> None:
     """Compute the Gramian of more than four rows in tiles of 2 x 2.
 
-    Data of the chunk stay in the cache.
+    The data of the chunk stay in the cache.
     """
     tile = np.empty((2, 2))
     for i in range(0, count, 2):
@@ -268,7 +268,10 @@ def _divide(a: Rows, divisor: float) -> None:
 
 @strict_device
 def _plain(rows: Ints, count: int, divisor: float, start: int, narrow: Rows) -> None:
-    """Fill `narrow` with the sum of the rows, added in order in float32. Then divide the sum."""
+    """Fill `narrow` with the sum of the rows, added in order in float32.
+
+    After the addition, divide the sum by the divisor.
+    """
     n = narrow.size
     a = row(rows[0], start, n)
     if count == 1:

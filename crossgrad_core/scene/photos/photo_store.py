@@ -84,8 +84,8 @@ class PhotoStore:
     Several threads and processes may share the folder.
 
     Entries that were used since this object was created are never deleted. If space is needed, the
-    least recently used of all other entries are deleted first. If this does not free enough space,
-    or if the disk is full, no more photos are written.
+    least recently used of all other entries are deleted first. If the deletions do not free enough
+    space, or if the disk is full, no more photos are written.
 
     Args:
         folder: Path of the folder. The folder is created when the first photo is written.

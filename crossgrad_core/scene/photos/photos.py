@@ -100,7 +100,7 @@ class PhotoSource:
         files = [self.path] if self.mask is None else [self.path, self.mask]
         try:
             facts = [os.stat(path) for path in files]
-        except OSError:  # The decoder reports this error later.
+        except OSError:  # If a file cannot be read, the decoder raises the error later.
             return None
         marks = [(f.st_size, f.st_mtime_ns, f.st_ctime_ns, f.st_ino) for f in facts]
         return f"{made_by()} {[str(path.absolute()) for path in files]} {marks} {self}"
@@ -160,7 +160,7 @@ class PhotoSource:
     def _decode_mask(self) -> Pixels | None:
         """Decode the mask in the photo's size, with values 0 and 255.
 
-        If the sizes differ, the nearest pixel is used.
+        If the mask and the photo differ in size, the nearest pixel of the mask is used.
         """
         if self.mask is None:
             return None

@@ -2,8 +2,8 @@
 
 A JPEG file stores each block of 8 x 8 pixels as 8 x 8 frequencies. For a reduced size, the decoder
 uses only the lowest 4 x 4, 2 x 2 or 1 x 1 frequencies. With fewer frequencies, the full photo is
-never in memory. Progressive JPEG files need as much memory as before, because their decoder stores
-all frequencies.
+never in memory. For progressive JPEG files, a reduced size saves no memory, because the decoder
+stores all frequencies.
 """
 
 from pathlib import Path
@@ -69,7 +69,7 @@ def choose_reduction(path: Path, header: PhotoHeader, max_size: int | None) -> i
     """Choose the number by which both sides of a photo are divided during decoding: 1, 2, 4 or 8.
 
     The number is 1 for all photos that are small enough to be decoded completely. For larger
-    photos, the number is the largest one that leaves at least `max_size` pixels on the longest
+    photos, the number is the largest number that leaves at least `max_size` pixels on the longest
     side. If no number leaves so many pixels, the smallest possible number is used.
 
     Raises:

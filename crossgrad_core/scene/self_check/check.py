@@ -201,7 +201,7 @@ def checked(scene: Scene, path: Path, *, cache_mib: int, accept: bool = False) -
 def _is_decoded(pixels: Pixels, view: int) -> bool:
     """Decode a photo.
 
-    Return False if this fails. Code that needs the photo later reports the error.
+    Return False if the decoding fails. Code that needs the photo later reports the error.
     """
     try:
         pixels(view)

@@ -21,7 +21,7 @@ from crossgrad_core.scene.self_check.evidence import (
 
 #: Largest number of cameras in trials.
 MOST_CAMERAS: Final = 12
-#: A camera without tracks gets a score of 0 if fewer points are inside its photo.
+#: A camera without tracks gets a score of 0 if fewer points than this number are inside its photo.
 _FEWEST_UNTRACKED: Final = 3 * FEWEST
 #: A later trial replaces an earlier, simpler trial only if its score is higher by more than this
 #: number.
@@ -166,7 +166,7 @@ class Bench:
         return found
 
     def _searched(self, search: Search) -> tuple[float, Trial]:
-        """Search for the best numbers.
+        """Search for the numbers with the best score.
 
         Try all given values, then refine the best value with halved steps.
         """

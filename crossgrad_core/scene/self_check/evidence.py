@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 #: Orientation of photos that are neither rotated nor mirrored.
 UPRIGHT: Final = np.eye(2)
-#: With fewer observations, no correlation is computed.
+#: With fewer observations than this number, no correlation is computed.
 FEWEST: Final = 8
 #: Minimum number of observations if the colours of points are taken from other photos.
 FEWEST_OF_PHOTOS: Final = 24
@@ -52,7 +52,7 @@ class Rig:
         principal: [V, 2] principal points in pixels.
         sizes: [V, 2] widths and heights of the photos in pixels.
         points: [P, 3] points in input units.
-        photos: [V] number of the view whose photo is compared with each camera.
+        photos: [V] index of the view whose photo is compared with each camera.
         count: Number of photos in the scene.
         turn: [2, 2] matrix that rotates or mirrors all photos about their centres.
     """
@@ -178,10 +178,10 @@ class Evidence:
         pixels: Function that decodes the photo of a view.
         rig: The cameras and points.
         rows: [V, N] rows of the points that are compared in each camera, padded with -1.
-        colors: [P, 3] colours of the points. None means that each point has the mean colour that
-            other photos show.
-        tracked: True if `rows` contains observations. If False, points may be hidden or outside the
-            photo.
+        colors: [P, 3] colours of the points. If `colors` is None, each point has the mean colour
+            that other photos show.
+        tracked: True if `rows` contains observations. If `tracked` is False, points may be hidden
+            or outside the photo.
     """
 
     pixels: Pixels

@@ -44,7 +44,7 @@ class ContractError(AssertionError):
 def require(holds: object, otherwise: str) -> None:
     """Raise `ContractError(otherwise)` if `holds` is not true.
 
-    In contrast to `assert`, this also works with `python -O`.
+    In contrast to `assert`, this function also works with `python -O`.
     """
     if not holds:
         raise ContractError(otherwise)

@@ -2,7 +2,7 @@
 
 The size of a state may depend on the number of views, on the number of primitives, and on a window
 of recent steps. A state must not grow with every step, because each checkpoint would be larger than
-the previous one.
+the previous checkpoint.
 """
 
 import gc
@@ -22,7 +22,7 @@ from crossgrad_core.testing.support.contract import require
 #: size.
 _FEW = 16
 #: Number of steps in each of the three windows of the second test. A state that covers fewer recent
-#: steps than this has already stopped growing.
+#: steps than this number has already stopped growing.
 _WINDOW = 1000
 
 

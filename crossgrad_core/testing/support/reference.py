@@ -267,7 +267,7 @@ def _require_all(rasterizer: Rasterizer, cases: Callable[[], Iterator[_Case]]) -
 def its_options_are_heeded(make: Make[Rasterizer]) -> None:
     """The options `max_alpha`, `near` and `dilation` work as the rules define.
 
-    A rasterizer may also allow only one value.
+    A rasterizer may also support only one value of an option.
     """
     rasterizer, tried = make(), 0
     for case in _options():

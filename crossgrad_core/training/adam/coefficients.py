@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from math import sqrt
 
-# Gradients and first moments below this value count as 0. Further decay would make them subnormal.
-# With eps = 1e-15, a smaller first moment moves a parameter by less than 1e-14 times the learning
-# rate.
+# Gradients and first moments below this value count as 0. Further decay would make these gradients
+# and moments subnormal. With eps = 1e-15, a smaller first moment moves a parameter by less than
+# 1e-14 times the learning rate.
 TINY = 1e-30
 
 

@@ -263,7 +263,7 @@ def bargain(cosines: Floats, beta: Floats) -> bool:
             beta[i] *= 1.0 + damping * step[i]
         if beta.max() > ENDLESS:
             return False
-        # After each full step, the decrement is about the square of the previous one, until
+        # After each full step, the decrement is about the square of the previous decrement, until
         # rounding ends the convergence.
         if decrement <= DECREMENT or decrement > 0.5 * last:
             return True

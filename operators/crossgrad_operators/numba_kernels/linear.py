@@ -29,8 +29,8 @@ PIVOT = 1e-15
 SWEEPS = 30
 #: With 32 digits, an off-diagonal element counts as zero up to this share of its diagonal elements.
 NEGLIGIBLE = 1e-31
-#: An element also counts as zero up to this share of the largest element. The share is so large
-#: that its square does not underflow in float64.
+#: An element also counts as zero if its magnitude is at most this share of the largest element. The
+#: share is so large that its square does not underflow in float64.
 VANISHING = 1e-140
 
 

@@ -10,9 +10,9 @@ The cosines contain rounding errors, so the smallest eigenvalues of the cosine m
 small number (the ridge) is therefore added to the diagonal, so that the matrix becomes positive
 definite. The ridge keeps the multipliers bounded, and makes the multipliers continuous functions of
 the cosines. If the ridge affects the result visibly, the solution is repeated, starting from the
-previous solution (proximal point iteration). After this, the component along an eigenvector with
-eigenvalue l is too small only by the share (ridge / (l + ridge))^ROUNDS. If the directions are not
-nearly dependent, one round is enough.
+previous solution (proximal point iteration). After these rounds, the component along an eigenvector
+with eigenvalue l is too small only by the share (ridge / (l + ridge))^ROUNDS. If the directions are
+not nearly dependent, one round is enough.
 """
 
 from typing import NamedTuple
@@ -62,7 +62,7 @@ class Rounding(NamedTuple):
         slack: A constraint counts as violated if the violation exceeds this share of its terms.
         shown: The effect of the ridge is corrected if the ridge exceeds this share of a pivot.
         noise: Rounding error of |sum x_k e_k|^2, relative to sum x_k^2. Opposite gradients with
-            half as many digits can differ by such an amount.
+            half as many digits can differ by this amount.
     """
 
     exact: Exact

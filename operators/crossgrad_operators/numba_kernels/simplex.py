@@ -166,8 +166,8 @@ class Search(NamedTuple):
 def _limits(search: Search) -> tuple[float, float]:
     """Return a lower and an upper limit of the level.
 
-    Below the first level, no constraint is active. At the second level, one constraint alone
-    already has the distance rho.
+    Below the lower limit, no constraint is active. At the upper limit, one constraint alone already
+    has the distance rho.
     """
     low, high = np.inf, np.inf
     for k in range(len(search.r)):
@@ -211,7 +211,7 @@ def _change(problem: Polyhedron, count: int, search: Search, level: Pair, ridge:
 def _is_beyond_reach(problem: Polyhedron, search: Search) -> bool:
     """Return True if only the ridge keeps the multipliers bounded.
 
-    The sum of such multipliers is rounding noise.
+    If only the ridge bounds the multipliers, the weighted sum of the directions is rounding noise.
     """
     total = 0.0
     for k in range(len(search.r)):

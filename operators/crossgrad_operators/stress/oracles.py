@@ -1,7 +1,7 @@
 """Reference implementations (oracles) of all operators with 50 digits, written from their formulas.
 
 An oracle receives the exact Gramian of the views that have a gradient, and returns the weights of
-these views. Oracles include two thresholds of our definitions: the limit 1 + cos = 1e-12 for
+these views. Oracles include two thresholds that crossgrad defines: the limit 1 + cos = 1e-12 for
 opposite directions, and the eigenvalue limit of Aligned-MTL.
 """
 
@@ -84,7 +84,7 @@ def is_noise(cosine: Matrix, x: Sequence[Number]) -> bool:
 def cancels(square: Number, largest: Number) -> bool:
     """Return True if a sum counts as zero.
 
-    `square` is its squared length, and `largest` is the length of its longest summand.
+    `square` is the squared length of the sum, and `largest` is the length of the longest summand.
     """
     return bool(square <= 2 * number(OPPOSITE) * largest**2)
 
@@ -147,7 +147,7 @@ class _Combination:
     Args:
         gramian: [n][n] Gramian.
         norms: [n] norms of the gradients.
-        i: Number of the gradient with which the sum starts.
+        i: Index of the gradient with which the sum starts.
     """
 
     def __init__(self, gramian: Matrix, norms: Vector, i: int) -> None:

@@ -1,9 +1,9 @@
 """The accuracy that each operator guarantees, and the gradients for which it is guaranteed.
 
-Inside this set, the relative error is at most `PROMISED` u kappa. Here u is the unit roundoff of
-the gradients' type, and kappa = max |w_k| |g_k| / |result|. Outside the set, the result is finite.
-The length of the result is at most a stated factor times the longest gradient. A test checks that
-docs/operators.md lists every operator and its factor.
+Inside the set of these gradients, the relative error is at most `PROMISED` u kappa. Here u is the
+unit roundoff of the gradients' type, and kappa = max |w_k| |g_k| / |result|. Outside the set, the
+result is finite. The length of the result is at most a stated factor times the longest gradient. A
+test checks that docs/operators.md lists every operator and its factor.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -145,7 +145,10 @@ def pairwise_bound(facts: Facts) -> float:
 
 
 def views_bound(facts: Facts) -> float:
-    """Return the number of views, but at least 8. Sums of equal signs never become shorter."""
+    """Return the number of views, but at least 8.
+
+    While elements with equal signs are summed, the partial sums never become smaller.
+    """
     return max(PROMISED, float(len(facts.norms)))
 
 

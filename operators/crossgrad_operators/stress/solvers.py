@@ -191,7 +191,7 @@ def _is_hopeless(cosine: Matrix, beta: Vector) -> bool:
 
 
 def aligned(question: Question) -> Vector:
-    """Return the weights sqrt(l_min) V L^-1/2 V^T p, using eigenvalues above n eps l_max."""
+    """Return the weights of Aligned-MTL, using eigenvalues above n eps l_max."""
     mp = require_mpmath().mp
     count = question.count
     cosine = cosines(question.gramian)

@@ -84,7 +84,7 @@ class GrowthRequest:
     def among(self, may_grow: Tensor | None) -> "GrowthRequest":
         """Restrict the request to anchors for which `may_grow` [P] is True.
 
-        None means all anchors.
+        If `may_grow` is None, all anchors may grow.
         """
         if may_grow is None:
             return self

@@ -26,7 +26,8 @@ SHARE = 256
 def join(jobs: Jobs, features: _Floats, rows: _Ints, views: _Floats, out: _Floats) -> None:
     """Write the inputs of the networks [A, F + V].
 
-    The inputs are rows [A] of the features [Q, F], then the views [A, V].
+    The inputs of an anchor are its row of the features [Q, F], followed by its row of the views [A,
+    V].
     """
     anchors, feature, view = len(rows), features.shape[1], views.shape[1]
     chunks = (anchors + SHARE - 1) // SHARE

@@ -53,7 +53,10 @@ def update(
 
 @kernel
 def moves(grad: _Floats, exp_avg: _Floats, exp_avg_sq: _Floats) -> bool:
-    """Return True if any gradient or moment is not 0. Otherwise, the Adam step changes nothing."""
+    """Return True if any gradient or moment is not 0.
+
+    If all are 0, the Adam step changes nothing.
+    """
     few = min(64, len(grad))
     for end in (few, len(grad)):
         count = 0

@@ -325,7 +325,7 @@ def update_all(
 
     Args:
         jobs: Job counters, passed by `parallel`.
-        rows: [R] numbers of the rows with a gradient, sorted and unique.
+        rows: [R] indices of the rows with a gradient, sorted and unique.
         width: Number of elements in a row.
         param: [N * width] values of the tensor.
         grad: [R * width] gradients of the listed rows.

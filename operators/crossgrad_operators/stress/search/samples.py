@@ -96,7 +96,7 @@ def _scale_rows(rng: np.random.Generator, rows: Rows) -> Rows:
 
 
 def _approach(rng: np.random.Generator, rows: Rows) -> Rows:
-    """Replace a row by plus or minus another row, plus a small share of itself."""
+    """Replace a row by plus or minus another row, plus a small share of the old row."""
     blocks, views, _ = rows.shape
     one, other = rng.integers(views, size=(2, blocks))
     every_block = np.arange(blocks)
