@@ -63,7 +63,10 @@ def as_plain(
 
 
 def _projected(axes: Tensor, means: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Return pixels to the right and down [N, 3] per local unit along the main axes [N, 3, 3]."""
+    """Project main axes [N, 3, 3] of length 1 to pixels.
+
+    The results are pixels to the right [N, 3] and pixels downwards [N, 3].
+    """
     pose = camera.world_to_camera.to(means, non_blocking=True)
     x, y, z = (means @ pose[:3, :3].T + pose[:3, 3])[:, :, None].unbind(1)
     row_u = camera.fx / z * (pose[0, :3] - x / z * pose[2, :3])
@@ -74,7 +77,7 @@ def _projected(axes: Tensor, means: Tensor, camera: Camera) -> tuple[Tensor, Ten
 def _determinant(u: Tensor, v: Tensor, scales: Tensor, dilation: float) -> Tensor:
     """Return the determinants [N] of the 2-D covariances, in px^4.
 
-    `dilation` is added to their diagonals.
+    `dilation` is added to the diagonals of the covariances.
     """
     u, v = u * scales, v * scales
     trace = u.square().sum(1) + v.square().sum(1)

@@ -216,9 +216,9 @@ def fingerprint(source: Path) -> str:
     """Return the SHA-256 of all source files that may affect a kernel in `source`.
 
     Numba itself detects changes of the kernel's file, but not of files whose functions are inlined.
-    The hash includes all files of the kernel's folder. The hash also includes all files that these
-    kernel files import from their own package or from the core. If an imported file is in a folder
-    of kernels, its imports are included as well.
+    The hash includes all files of the kernel's folder. The hash also includes all files that the
+    files of this folder import from their own package or from the core. If an imported file is in a
+    folder of kernels, its imports are included as well.
     """
     digest = hashlib.sha256()
     for path in sorted(_sources(source)):

@@ -319,7 +319,7 @@ def fitting_respects_the_user(make: Make[Backbone]) -> None:
 def passed_on_tensors_are_handed_over(make: Make[Backbone]) -> None:
     """A tensor in `passthrough` becomes part of the Gaussians unchanged.
 
-    `decode` does not read its values.
+    `decode` does not read the values of this tensor.
     """
     backbone = make()
     parameters = created(backbone)

@@ -94,7 +94,7 @@ def projected_values_stay_projected(make: Make[Exposure]) -> None:
 def a_view_that_was_not_seen_has_values(make: Make[Exposure]) -> None:
     """Held-out views get finite parameters.
 
-    Their shapes are the shapes of the parameters of training photos.
+    The parameters of held-out views have the shapes of the parameters of training photos.
     """
     exposure, scene = make(), sample_scene()
     starts = _starts(exposure)

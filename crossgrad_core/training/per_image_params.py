@@ -1,6 +1,7 @@
 """Exposure parameters for each photo: stored like the state of a plugin, with an Adam of their own.
 
-Snapshots, rollback and checkpoints include all plugin states, and therefore also these parameters.
+Snapshots, rollback and checkpoints include all plugin states, and therefore also the exposure
+parameters.
 """
 
 import json
@@ -202,7 +203,9 @@ def check_photos_are(setup: Setup, state: TrainState) -> None:
 
 
 def write_photos(setup: Setup, state: TrainState, path: Path) -> bool:
-    """Write the parameters of all training photos. Without such parameters, write no file.
+    """Write the parameters of all training photos.
+
+    If the exposure has no parameters, write no file.
 
     Return True if a file was written.
     """

@@ -152,10 +152,10 @@ class TrainState:
     """All values that a training step reads and changes.
 
     Attributes:
-        tensors: The parameters as present in memory. Some rows may have deferred Adam steps, and
-            other threads may still be changing rows.
-        moments: The optimizer's moments as present in memory. Deferred steps and running steps also
-            change the moments.
+        tensors: The parameters in memory. Some rows may have deferred Adam steps, and other threads
+            may still be changing rows.
+        moments: The optimizer's moments in memory. Deferred steps and running steps also change the
+            moments.
         rngs: Name of a random stream -> its generator.
         states: Name of a plugin -> its state.
         step: Number of steps, including the present step.

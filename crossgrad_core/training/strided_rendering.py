@@ -39,7 +39,7 @@ def corner_of(step: int, slot: int, stride: int) -> Corner:
 def camera_of(camera: Camera, stride: int, corner: Corner) -> Camera:
     """Return the camera whose pixels are every n-th pixel of `camera`, from `corner` on.
 
-    The centre of its pixel (i, j) is the centre of pixel `corner` + n (i, j) of `camera`.
+    The centre of pixel (i, j) of the result is the centre of pixel `corner` + n (i, j) of `camera`.
     """
     column, row = corner
     return replace(

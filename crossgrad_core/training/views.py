@@ -626,7 +626,7 @@ class RenderCallback:
     Attributes:
         setup: Setup of the run.
         state: The training state.
-        counted: True if these renders are included in the number of rendered views.
+        counted: True if the renders of this function are included in the number of rendered views.
     """
 
     setup: Setup

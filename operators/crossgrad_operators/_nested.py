@@ -101,7 +101,7 @@ def inner_objections(selection: Selection, operator: Operator) -> list[str]:
 
 
 def inner_idle(selection: Selection, option: str, operators: Iterable[Operator]) -> dict[str, str]:
-    """Return a message for `option` if some options of its inner operators have no effect."""
+    """Return a message for `option` if the inner operators have options without effect."""
     messages = [
         f"{component_name(operator)}.{name}: {why}"
         for operator in operators

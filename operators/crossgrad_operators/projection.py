@@ -151,8 +151,8 @@ def project(
         gates = np.ones(gramians.shape, np.bool_)
     rule = (float(threshold), float(strength))
     # With two views, the error of a projection is the error of a single cosine. With more views,
-    # the errors of several cosines add up. For float32 gradients, these errors are below the
-    # precision of the gradients.
+    # the errors of several cosines add up. For float32 gradients, the errors of the cosines are
+    # below the precision of the gradients.
     many = gramians.shape[1] > 2  # noqa: PLR2004
     if context.unit < NARROW and many and context.rounding_residuals is not None:
         rest = context.rounding_residuals()

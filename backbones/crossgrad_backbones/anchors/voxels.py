@@ -82,7 +82,7 @@ def numbered(cells: Tensor) -> Tensor:
 def free_cells(wanted: Tensor, taken: Tensor) -> tuple[Tensor, Tensor]:
     """Return the distinct empty cells among the wanted cells.
 
-    Also return, for each wanted cell, its position among these distinct cells.
+    Also return, for each wanted cell, its position in the list of empty cells.
 
     Args:
         wanted: [N, 3] int64 wanted cells.

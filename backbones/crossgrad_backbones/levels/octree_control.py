@@ -95,7 +95,7 @@ def grown(
     Args:
         parameters: The parameters of an octree backbone, detached from autograd.
         request: The requests for new anchors.
-        thresholds: The gradients for which anchors are added.
+        thresholds: The gradient thresholds of all levels.
         cameras: [C, 3] camera centres in local units.
 
     Returns:

@@ -167,7 +167,7 @@ def _identified(file: BinaryIO, path: Path) -> "Image":
 def admit(head: bytes, path: Path) -> bool:
     """Return True if a file is HEIC or HEIF.
 
-    For such a file, the function also enables Pillow to open it.
+    For a HEIC or HEIF file, the function also enables Pillow to open the file.
 
     Args:
         head: The first bytes of the file.

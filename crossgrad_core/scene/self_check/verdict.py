@@ -222,7 +222,7 @@ class _Group:
         return np.asarray(unlike | out)
 
     def verdict(self) -> Verdict:
-        """Return the verdict on these photos."""
+        """Return the verdict on the photos of this group."""
         correlation = self.agreement.correlation
         has_correlation = np.isfinite(correlation)
         verdict = Verdict(
@@ -253,7 +253,7 @@ class _Group:
     def _of_all(self, rows: Integers) -> Cause | None:
         """Find a change of all cameras that improves photos which agree only in part.
 
-        If no change improves these photos, return None.
+        If no change improves the photos, return None.
         """
         bench = Bench(self.evidence, rows)
         if bench.before < _SURE:
@@ -365,7 +365,7 @@ class _Group:
     def _fits(self, after: Floats, rows: Integers) -> Booleans:
         """Return a mask of the photos that fit only after a change.
 
-        `after` contains their scores after the change.
+        `after` contains the scores of all photos after the change.
         """
         before = scores(self.agreement, tracked=self.evidence.tracked)[rows]
         return np.asarray((after > before + _FITS_BETTER) & (after > self._fitting))

@@ -27,8 +27,8 @@ def step_along_axes(positions: Tensor, steps: Tensor, scales: Tensor, quats: Ten
     """Add steps to positions in place, after stretching each step along the axes of its Gaussian.
 
     The length of a step does not change along an axis of typical length. Each Gaussian has three
-    axis lengths. The typical length is a median over all Gaussians. For each Gaussian, the middle
-    one of its three axis lengths is used.
+    axis lengths. The typical length is a median over all Gaussians. The median is computed over the
+    middle of the three axis lengths of each Gaussian.
 
     Args:
         positions: [N, 3].

@@ -193,7 +193,7 @@ def _same_shares(
 ) -> bool:
     """Write the weights of more than two views to `weights`.
 
-    Return True if these weights are ill-conditioned.
+    Return True if the weights are ill-conditioned.
     """
     n = places.size
     longest, _ = longest_of(norms)

@@ -27,7 +27,8 @@ PIVOT = 1e-15
 #: Maximum number of Jacobi sweeps over the matrix. For 16 rows, six sweeps are enough with 16
 #: digits, and eight sweeps with 32 digits.
 SWEEPS = 30
-#: With 32 digits, an off-diagonal element counts as zero up to this share of its diagonal elements.
+#: With 32 digits, an off-diagonal element a_ij counts as zero if its magnitude is at most this
+#: share of sqrt(a_ii a_jj).
 NEGLIGIBLE = 1e-31
 #: An element also counts as zero if its magnitude is at most this share of the largest element. The
 #: share is so large that its square does not underflow in float64.

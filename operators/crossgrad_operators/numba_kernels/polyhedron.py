@@ -3,8 +3,9 @@
 Only the cosines of the e_k are needed.
 
 For the given point sum b_k e_k, the nearest point is sum (b_k + y_k) e_k with y >= 0. A multiplier
-y_k is positive only if x.e_k = h_k. MGDA, CAGrad, UPGrad and DualProj all need such a point. If the
-e_k are linearly dependent, the nearest point is unique, but the multipliers are not.
+y_k is positive only if x.e_k = h_k. MGDA, CAGrad, UPGrad and DualProj all need a nearest point of a
+polyhedron. If the e_k are linearly dependent, the nearest point is unique, but the multipliers are
+not.
 
 The cosines contain rounding errors, so the smallest eigenvalues of the cosine matrix are unknown. A
 small number (the ridge) is therefore added to the diagonal, so that the matrix becomes positive
@@ -263,7 +264,8 @@ def approach(problem: Polyhedron) -> int:
     The function uses the active-set method of Lawson and Hanson.
 
     Returns:
-        The number of active constraints. `substitute` can use their factorization.
+        The number of active constraints. `substitute` can use the factorization of the active
+        constraints.
     """
     views, share = problem.active.size, problem.rounding.slack
     _unbar(problem)

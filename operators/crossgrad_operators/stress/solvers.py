@@ -214,7 +214,7 @@ def aligned(question: Question) -> Vector:
 def _vanishes(cosine: Matrix, x: Vector) -> bool:
     """Return True if a combination is zero.
 
-    For two directions, exactly opposite directions also count as zero.
+    For two directions, the sum of exactly opposite directions also counts as zero.
     """
     largest = max(abs(v) for v in x)
     exactly = form(cosine, x) <= number(VANISHED) * largest**2

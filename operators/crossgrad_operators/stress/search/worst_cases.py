@@ -96,7 +96,7 @@ class WorstCases:
     def fail(self, sample: Sample, reason: str) -> None:
         """Count a case that breaks a guarantee.
 
-        The first few of these cases are stored for the report.
+        The first few failed cases are stored for the report.
         """
         self.broken += 1
         if len(self.failures) < KEPT:
