@@ -25,8 +25,8 @@ def plain_sums(columns: Sequence[Column], divisor: int, *, keep: bool) -> list[T
     Args:
         columns: T columns of contiguous gradients, dense or sparse in rows; None is left out.
         divisor: Number by which the sums are divided.
-        keep: True to leave the gradients unchanged. Otherwise, each result overwrites the first
-            gradient of its column.
+        keep: True to leave the gradients unchanged. If `keep` is False, each result overwrites the
+            first gradient of its column.
 
     Returns:
         T sums; None for a column without gradients.

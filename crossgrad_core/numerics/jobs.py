@@ -120,7 +120,7 @@ class Begun:
     def end(self) -> None:
         """Execute the remaining jobs on this thread, too. Return when all jobs are done.
 
-        Afterwards, the object holds no references, and further calls have no effect.
+        After `end`, the object holds no references, and further calls have no effect.
         """
         if self._own is None:
             return

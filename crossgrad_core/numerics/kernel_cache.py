@@ -59,8 +59,8 @@ def cache_for(function: Callable[..., Any]) -> Any:  # noqa: ANN401 - Numba's ca
 
     The cache is on disk if a folder is writable; otherwise, nothing is cached.
 
-    The folder is `NUMBA_CACHE_DIR` if this variable is set. Otherwise, the folder is `__pycache__`
-    next to the kernel's file, or the user's cache folder.
+    The folder is `NUMBA_CACHE_DIR` if this variable is set. If this variable is not set, the folder
+    is `__pycache__` next to the kernel's file, or the user's cache folder.
     """
     try:
         return _DiskCache(function)

@@ -209,9 +209,9 @@ class Calibration:
     def _options(self) -> "pycolmap.UndistortCameraOptions":
         """The options of pycolmap's undistortion.
 
-        For a very wide lens, rays below 90 degrees from the axis may all be inside the photo. In
-        this situation, pycolmap shrinks the undistorted photo to the smallest allowed size. In this
-        situation, the options require at least the size of the original photo.
+        For a very wide lens, rays below 90 degrees from the axis may all be inside the photo. For
+        such a lens, pycolmap shrinks the undistorted photo to the smallest allowed size. The
+        options for such a lens therefore require at least the size of the original photo.
         """
         guard_pycolmap()
         import pycolmap

@@ -227,8 +227,8 @@ def differences(was: Fingerprint, now: Fingerprint) -> list[Difference]:
 
     The list is empty if both scenes are equal.
 
-    If the training views change, the local frame and all values in local units change as well. In
-    this situation, only the change of the training views is reported.
+    If the training views change, the local frame and all values in local units change as well. If
+    the training views have changed, only this change is reported.
     """
     changes = _views(was, now)
     if not any(change.weight is Weight.PLACE for change in changes):

@@ -47,7 +47,7 @@ def checks_of(slot: str) -> tuple[AnyCheck, ...]:
 def check_entry(entry: registry.Entry) -> list[Result]:
     """Load a plugin and run all checks of its slot.
 
-    If the plugin cannot be loaded, only report this.
+    If the plugin cannot be loaded, return only a failed result for the loading.
     """
     taken = _taken(entry)
     names = (

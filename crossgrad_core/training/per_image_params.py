@@ -255,8 +255,8 @@ def take_photo_step(
         return
     held = state.states[STATE]
     tensors = {name: tensor.clone() for name, tensor in held.tensors.items()}
-    # Keep the step counts on the CPU. After a checkpoint is loaded, the counts may be on the GPU.
-    # With the counts on the GPU, reading a count in each step would wait for the GPU.
+    # Keep the step counts on the CPU. After a checkpoint is loaded, the step counts may be on the
+    # GPU. With the counts on the GPU, reading a count in each step would wait for the GPU.
     tensors[_COUNT] = tensors[_COUNT].cpu()
     rates = {name: parameter.lr.at(progress) for name, parameter in setup.per_photo.items()}
     for row, gradients in _summed(taken).items():

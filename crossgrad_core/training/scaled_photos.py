@@ -42,7 +42,7 @@ class ScaledPhotos:
     def get(self, view: View, camera: Camera, full: Callable[[View], Pair]) -> Pair:
         """Return the photo and the mask of a view in the camera's size.
 
-        The cache shares both tensors, so do not change them.
+        The cache shares the photo and the mask with its callers, so callers must not change them.
 
         Args:
             view: The view.

@@ -156,7 +156,7 @@ class Dispatch(GramianOperator):
     def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
         """Return the objections of all operators.
 
-        Rules for blocks that do not exist cause objections, too.
+        Rules for blocks that do not exist also cause objections.
         """
         reasons = [
             reason

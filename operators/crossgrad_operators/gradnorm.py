@@ -32,10 +32,9 @@ class GradNorm(GramianOperator):
 
     The target for G_s = w_s |g_s| of group s is mean(G) (l_s / mean l)^alpha. Here l_s is the
     average loss of the group divided by its initial loss. In each step, log w_s moves by a fixed
-    amount towards the target. Then the weights are scaled. The sum of the weights of all groups
-    with a gradient becomes the number of these groups. Each block and group has one weight, which
-    applies to all views of the group. Losses are stored separately for each octave of the image
-    scale.
+    amount towards the target. The weights are scaled such that their sum over the groups with a
+    gradient equals the number of these groups. Each block and group has one weight, which applies
+    to all views of the group. Losses are stored separately for each octave of the image scale.
     """
 
     identity_at_one: ClassVar[bool] = True

@@ -53,8 +53,8 @@ def white_of(deep: Sequence[Path]) -> tuple[int, list[str]]:
     dark if their largest value matches neither the 16-bit range nor a smaller range.
 
     Args:
-        deep: Paths of the 16-bit photos. Photos are decoded until one of them is bright enough for
-            the 16-bit range.
+        deep: Paths of the 16-bit photos. Photos are decoded until the values of a photo reach the
+            16-bit range.
 
     Raises:
         UserError: A photo is damaged.

@@ -35,7 +35,7 @@ def note_pairing(
 ) -> list[str]:
     """Note posed images without a photo and photos without a pose.
 
-    Photos whose names differ in suffix or letter case are noted, too.
+    Note photos whose names differ in suffix or letter case.
     """
     absent = [name for name in names if name not in paths]
     used_paths = frozenset(used)

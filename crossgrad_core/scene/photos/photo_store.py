@@ -114,7 +114,7 @@ class PhotoStore:
     def decoded(self, source: Storable) -> Decoded:
         """Return the photo from its entry if the entry is valid.
 
-        Otherwise, decode the photo and store the decoded photo.
+        If the entry is invalid, decode the photo and store the decoded photo.
 
         Raises:
             UserError: The photo is damaged.

@@ -89,7 +89,7 @@ class Rig:
     def chosen(self, views: Sequence[int] | Integers) -> "Rig":
         """Return a rig that contains only some of the cameras.
 
-        Each camera keeps the photo with which it is compared.
+        Each camera is still compared with its photo.
         """
         rows = np.asarray(views, dtype=np.int64)
         return replace(

@@ -156,7 +156,7 @@ class _Group:
         evidence: The cameras, points and photos to compare.
         views: [V] indices of the views in the scene.
         agreement: How well the photos agree with the points without any change.
-        recolored: True if the colours of the points contain no information. If this is True,
+        recolored: True if the colours of the points contain no information. If `recolored` is True,
             colours from other photos replace the colours of the points.
     """
 

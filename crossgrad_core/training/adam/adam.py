@@ -115,8 +115,8 @@ def update_tensors(updates: Iterable[Update]) -> None:
 def _update_fused(updates: Sequence[Update]) -> None:
     from crossgrad_core.training.adam.numba_kernels.fused import update_at
 
-    # The kernel receives only addresses. Keep references until the step is done. Otherwise, the
-    # contiguous copies of gradients would be freed too early.
+    # The kernel receives only addresses. Keep references until the step is done. Without these
+    # references, the contiguous copies of gradients would be freed too early.
     laid_out = [(p, g.contiguous(), m, v) for p, g, m, v, _ in updates]
     addresses = [[tensor.data_ptr() for tensor in four] for four in laid_out]
     sizes = [param.numel() for param, *_ in laid_out]

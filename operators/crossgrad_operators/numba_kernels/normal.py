@@ -7,7 +7,7 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.int64]
 
-#: Two directions count as exactly opposite if 1 + cos is at most this value. Otherwise, a
+#: Two directions count as exactly opposite if 1 + cos is at most this value. Without this limit, a
 #: projection would leave rounding noise, which Adam would scale to a full step.
 OPPOSITE = 1e-12
 #: A combination of gradients counts as zero if its squared length is at most this share of the

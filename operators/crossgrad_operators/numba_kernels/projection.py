@@ -172,9 +172,9 @@ def aligned_to_targets(
     """Return the rows v_i [B, K, K] of GradVac, and update `targets`.
 
     For each i and all j in order[i]: phi = cos(v, g_j). If phi is below the target t_ij, a multiple
-    of g_j is added to v, so that the cosine becomes t_ij. Then t_ij <- (1 - beta) t_ij + beta phi,
-    clipped to +-0.999. A vector v becomes exactly zero under the conditions that `projected`
-    describes.
+    of g_j is added to v, so that the cosine becomes t_ij. In any case, the target t_ij becomes (1 -
+    beta) t_ij + beta phi, clipped to +-0.999. A vector v becomes exactly zero under the conditions
+    that `projected` describes.
 
     Args:
         gramians: [B, K, K] Gramians.

@@ -287,8 +287,8 @@ def _defined(problem: Polyhedron, search: Search) -> float:
     """Return the share of CAGrad's direction that is well defined. The multipliers are not changed.
 
     The direction is undefined if 0 is a convex combination of the gradients and the point of level
-    0 is within the distance rho. In this situation, no level above 0 can be reached, and many
-    directions are equally good.
+    0 is within the distance rho. If the direction is undefined, no level above 0 can be reached,
+    and many directions are equally good.
     """
     largest, rho = 0.0, search.rho[0][0]
     for k in range(len(search.r)):

@@ -302,8 +302,9 @@ def _as_far_as(cosine: Matrix, base: Vector, r: Vector, rho: Number) -> Vector |
 
     The level is the one for which the distance is rho.
 
-    Return None if 0 is a convex combination and level 0 is reached within this distance. In this
-    situation, no level above 0 can be reached, and the direction is undefined.
+    Return None if 0 is a convex combination and level 0 is reached within this distance. If level 0
+    is reached within this distance, no level above 0 can be reached, and the direction is
+    undefined.
     """
     q = apply(cosine, base)
     x = shortest(cosine, r)

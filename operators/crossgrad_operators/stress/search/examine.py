@@ -18,7 +18,8 @@ from crossgrad_operators.stress.verdict import ExactCase, Finding, by_law, facts
 
 Floats = NDArray[np.float64]
 
-#: Factor for gradients, a power of two. Results must be multiplied by this factor, too.
+#: Factor for gradients, a power of two. If the gradients are multiplied by this factor, the results
+#: must be multiplied by this factor, too.
 _SCALE: Final = 2.0**20
 #: Relative change of gradients. Results must change only a little.
 _NUDGE: Final = 1e-12

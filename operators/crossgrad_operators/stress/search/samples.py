@@ -37,7 +37,7 @@ class Sample:
 
     @property
     def precision(self) -> str:
-        """The name of the type."""
+        """The name of the gradients' type."""
         return str(self.dtype).removeprefix("torch.")
 
     def text(self) -> str:
