@@ -125,7 +125,10 @@ def _finite_scales(log_scales: Tensor) -> Tensor:
 
 
 def _per_axis(values: Tensor) -> Tensor:
-    """Repeat the values to a contiguous array [N, 3]. Operations on an expanded view are slower."""
+    """Repeat each value three times, and return a contiguous array [N, 3].
+
+    Operations on an expanded view are slower.
+    """
     return values[:, None].expand(-1, 3).contiguous()
 
 

@@ -87,8 +87,8 @@ def growth_ahead(setup: Setup, crowd: PrimitiveCounts, schedule: Schedule, step:
     ahead = schedule.edits(step)
     if ahead and setup.numbers.growth == "budget":
         # Some primitive budgets exceed the number of primitives that a run reaches, for example in
-        # runs of about the published length. Without this limit, the cost of runs with such a large
-        # budget would be overestimated.
+        # runs of about the published length. Without this limit, the cost of runs with a very large
+        # primitive budget would be overestimated.
         return min(1.0 + COST_PER_EDIT * COUNTED_EDITS, _along_curve(setup, crowd, schedule, step))
     done = schedule.edits_before + schedule.edits() - ahead
     return 1.0 + COST_PER_EDIT * min(ahead, max(0, COUNTED_EDITS - done))

@@ -3,8 +3,8 @@
 Weights w with w >= 0 and sum w = 1 are stored as x_k = w_k |g_k| / s, where s is the smallest norm.
 In this form, the combination is sum x_k e_k for unit gradients e_k. In this form, the combination
 depends only on the cosines, for any ratio of norms. The constraint is sum_k r_k x_k = 1 with r_k =
-s / |g_k|. Up to a factor, both methods need the nearest point in a polyhedron {x: x.e_k >= level
-r_k}:
+s / |g_k|. Up to a factor, MGDA and CAGrad both need the nearest point in a polyhedron {x: x.e_k >=
+level r_k}:
 
 - MGDA: for any level, the point nearest to 0 has the direction of the shortest combination.
 - CAGrad: let d be the direction that maximizes min_k g_k.d in the ball with radius rho around g_0.
@@ -110,7 +110,8 @@ def _mgda_pair(cosine: float, r: Pairs, x: Pairs) -> None:
 def _shortest(problem: Polyhedron, x: Pairs) -> float:
     """Compute x for the shortest combination.
 
-    Return the share of x that is not rounding noise. The array `problem.heights` must contain r.
+    Return the share of x that is not rounding noise. The array `problem.heights` must contain the
+    quotients r_k = s / |g_k|.
     """
     exact, r = problem.rounding.exact, problem.heights
     if len(x) == 2 and exact is None and r[0, 0] > 0.0 and r[1, 0] > 0.0:
@@ -357,7 +358,7 @@ def _cagrad_two(norms: Pairs, cosine: float, c: float, result: Floats) -> None:
 def _set_out(problem: Polyhedron, norms: Pairs, q: Pairs, c: float) -> Search:
     """Return the search that starts at the mean, in units of the longest gradient.
 
-    The array `problem.heights` must contain r.
+    The array `problem.heights` must contain the quotients r_k = s / |g_k|.
     """
     exact, views = problem.rounding.exact, len(norms)
     longest, count = longest_of(norms)
@@ -413,7 +414,7 @@ def _least_cosine(problem: Polyhedron) -> float:
 def _cagrad(problem: Polyhedron, norms: Pairs, q: Pairs, c: float, result: Floats) -> None:
     """Write the weights [K] of one block to `result`.
 
-    The array `problem.heights` must contain r.
+    The array `problem.heights` must contain the quotients r_k = s / |g_k|.
     """
     views, exact = len(norms), problem.rounding.exact
     _, count = longest_of(norms)

@@ -75,7 +75,7 @@ def rectify_back(
 def count(opacities: _Floats, starts: _Ints) -> None:
     """Write `starts` [A + 1], the index of the first Gaussian of each anchor.
 
-    The opacities are [A, k].
+    The array of opacities has the shape [A, k].
     """
     anchors, slots = opacities.shape
     total = 0

@@ -49,8 +49,8 @@ NUMBERS = 7
 #: contiguous memory for one call of `update`.
 _ROWS = 1024
 _GATHERED = 128
-#: Number of gradient elements that `update_all` gathers at a time. For rows of any width, so many
-#: elements fill complete cache lines. The gathered gradients fit into the first-level cache
+#: Number of gradient elements that `update_all` gathers at a time. This number of elements fills
+#: complete cache lines for rows of any width. The gathered gradients fit into the first-level cache
 #: together with their parameters and moments.
 _AT_ONCE = 768
 #: Largest number of consecutive long rows that are updated in one call.
