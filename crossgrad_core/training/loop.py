@@ -168,7 +168,7 @@ class Prefetcher:
     def _follow(self, state: TrainState) -> None:
         """Drop the prediction for the last step.
 
-        If this prediction was wrong, drop all predictions.
+        If the prediction for the last step was wrong, drop all predictions.
         """
         if self._draws and self._step - len(self._draws) == state.step - 1:
             drawn = self._draws.popleft()

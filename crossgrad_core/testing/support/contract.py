@@ -32,8 +32,8 @@ Make = Callable[[], C]
 #: check does not apply.
 Check = Callable[[Make[C]], None]
 
-#: Numbers of views per step that the checks try. Numbers that the component does not support are
-#: skipped.
+#: Numbers of views per step that the checks try. Numbers of views that the component does not
+#: support are skipped.
 VIEW_COUNTS = range(1, 7)
 
 

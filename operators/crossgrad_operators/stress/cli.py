@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 #: Default number of elements of the largest gradients.
 LARGE = 10_000_000
-#: Option -> kinds of tests that use this option. The empty string means the fixed test cases.
+#: Option -> kinds of tests that use this option. An empty kind of test means the fixed test cases.
 _USED: Final[Mapping[str, tuple[str, ...]]] = {
     "--case": ("",),
     "--elements": ("",),
