@@ -14,8 +14,8 @@ from crossgrad_plugins.compare.quantity import Quantity
 from crossgrad_plugins.compare.run import Run
 from crossgrad_plugins.compare.statistics import Estimate, Verdict, corrected, estimate, verdicts
 
-#: Largest significant p-value. If at least the second value, a share of the pairs, is missing, the
-#: claim stays open.
+#: `_SURE`: a p-value below this number is significant. `_LOST`: a claim stays open if at least
+#: this share of the pairs is missing.
 _SURE, _LOST = 0.05, 0.25
 #: The metric on which the verdicts are based. If the exposure of held-out photos is guessed
 #: wrongly, plain PSNR depends more on this guess than on the scene. Different arms then have

@@ -131,7 +131,10 @@ class Probes:
 def figures_of(
     runs: Sequence[Run], capture: Capture, name: str, *, file: bool
 ) -> dict[Path, dict[str, float]]:
-    """Return folder of a run -> photo -> metric of its model, or of its PLY drawn on black.
+    """Return the metric of each run on each photo of the capture.
+
+    The outer keys are the folders of the runs. The inner keys are the names of the photos. If
+    `file` is True, the PLY of the run is rendered on black, else the model of the run.
 
     Raises:
         UserError: The metric does not exist, or a run cannot be evaluated.

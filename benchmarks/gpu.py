@@ -158,7 +158,10 @@ def finished(folder: Path) -> Path | None:
 
 
 def measured(case: Case, scene: Path, out: Path) -> tuple[Path | None, str]:
-    """Train the case's run if it is missing. Return its folder, or None and the reason."""
+    """Train the case's run if it is missing.
+
+    Return the folder of the run and an empty text. If training failed, return None and the reason.
+    """
     folder = out / "runs" / case.name
     if (run := finished(folder)) is not None:
         return run, ""

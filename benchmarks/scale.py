@@ -137,7 +137,10 @@ def groups(*, full: bool) -> Iterator[tuple[str, list[Cell]]]:
 
 
 def memory_cells(*, full: bool) -> Iterator[tuple[Cell, bool]]:
-    """Yield cells for memory, and True if the last step edits the set of Gaussians."""
+    """Yield the cases of the memory measurement as pairs of a cell and a flag.
+
+    The flag is True if density control edits the Gaussians in the last step.
+    """
     count = 1_000_000 if full else 200_000
     pair = Cell(count, count, views=2, operator="pcgrad")
     for cell in (pair, replace(pair, visible=count // 10)):

@@ -63,9 +63,12 @@ def as_plain(
 
 
 def _projected(axes: Tensor, means: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Project main axes [N, 3, 3] of length 1 to pixels.
+    """Return the horizontal and vertical image components [N, 3] of the axes, in px per local unit.
 
-    The results are pixels to the right [N, 3] and pixels downwards [N, 3].
+    Args:
+        axes: [N, 3, 3] main axes of the Gaussians as unit vectors, one axis per column.
+        means: [N, 3] centres of the Gaussians.
+        camera: The camera. Its projection is linearised at the centres.
     """
     pose = camera.world_to_camera.to(means, non_blocking=True)
     x, y, z = (means @ pose[:3, :3].T + pose[:3, 3])[:, :, None].unbind(1)

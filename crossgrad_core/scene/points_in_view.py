@@ -14,8 +14,8 @@ from crossgrad_core.scene.frame import camera_centers
 from crossgrad_core.scene.point_cloud import PointCloud
 from crossgrad_core.scene.raw import RawView
 
-#: Number of points and of photos that are tested, and minimum share of the points that some photo
-#: must show.
+#: `_TRIED`: approximate number of tested points, and of tested photos. `_FEWEST`: minimum share
+#: of the tested points that must be inside at least one photo.
 _TRIED: Final = 1000
 _FEWEST: Final = 0.01
 #: If photos show at least this share of the points after a change of the poses, the poses are

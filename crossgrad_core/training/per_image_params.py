@@ -279,7 +279,10 @@ def _values(setup: Setup, state: TrainState) -> dict[str, Tensor]:
 
 
 def _summed(taken: Iterable[tuple[int, Leaves]]) -> dict[int, dict[str, Tensor]]:
-    """Return row of a photo -> gradients of its parameters, summed over all draws of the photo."""
+    """Return the gradients of each photo's parameters, summed over all draws of the photo.
+
+    The outer keys are rows of photos. The inner keys are names of parameters.
+    """
     gradients_by_row: dict[int, dict[str, Tensor]] = {}
     for row, leaves in taken:
         gradients = gradients_by_row.setdefault(row, {})

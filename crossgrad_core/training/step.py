@@ -373,7 +373,7 @@ def check_largest_draw(setup: Setup) -> None:
     """Check that the sampler can draw the largest K of the run. Trial steps may use a smaller K.
 
     Raises:
-        UserError: The sampler cannot draw so many views.
+        UserError: The sampler cannot draw the largest K.
     """
     blank = TrainState({}, AdamState(), make_streams(setup.config.seed))
     context = sample_context(setup, blank, 1)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import strict_device, strict_kernel
 
-#: Number of columns that are filtered at a time; so many columns fit into the cache of a core.
+#: Number of columns that are filtered at a time. The columns then fit into the cache of a core.
 _BLOCK = 1024
 
 

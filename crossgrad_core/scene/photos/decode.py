@@ -26,8 +26,8 @@ WHITES = (1, _FULL_8_BIT, 1023, 4095, 16383, FULL_16_BIT)
 #: Largest share of grey pixels in a black-and-white mask. A pixel is grey if its difference from
 #: black and its difference from white exceed a tenth of the range.
 _MOST_GREY = 0.05
-#: Number of bytes of a photo that are copied at a time; so many bytes stay in the processor's
-#: cache.
+#: Number of bytes of a photo that are copied at a time. The copied bytes then stay in the
+#: processor's cache.
 _BAND = 1 << 19
 #: SciPy truncates its Gaussian filter at this number of standard deviations.
 _WIDTHS = 4.0

@@ -70,7 +70,7 @@ def choose_reduction(path: Path, header: PhotoHeader, max_size: int | None) -> i
 
     The number is 1 for all photos that are small enough to be decoded completely. For larger
     photos, the number is the largest number that leaves at least `max_size` pixels on the longest
-    side. If no number leaves so many pixels, the smallest possible number is used.
+    side. If no number leaves at least `max_size` pixels, the smallest possible number is used.
 
     Raises:
         UserError: The photo is too large. The message suggests a remedy.

@@ -29,8 +29,8 @@ MOST_TRIED: Final = 2_000
 _TESTED: Final = 1_500
 #: A point is hidden if another point in its image cell is nearer by at least this factor.
 _HIDES: Final = 1.15
-#: `_IN_A_CELL`: number of points in a cell of the depth test. `_CELLS`: largest number of cells in
-#: each direction.
+#: The depth test divides a photo into cells. `_IN_A_CELL`: mean number of points in a cell.
+#: `_CELLS`: largest number of cells along each image side.
 _IN_A_CELL, _CELLS = 6, 64
 #: Colours cannot be compared if their standard deviation is below this number of levels of 255.
 FLAT: Final = 4.0
@@ -325,7 +325,14 @@ def _unhidden(shares: Floats, depth: Floats, inside: Booleans) -> Booleans:
 
 
 def _compared(share: Floats, inside: Booleans, shown: Floats, expected: Floats) -> Agreement:
-    """Compute how photos and points agree, from the colours [V, N, 3] of the points inside."""
+    """Return the agreement of photos and points, from the colours of the points in each photo.
+
+    Args:
+        share: [V] share of the points that is inside the photo.
+        inside: [V, N] mask of the points whose colours are compared.
+        shown: [V, N, 3] colours of the photos at the points.
+        expected: [V, N, 3] colours of the points.
+    """
     number = inside.sum(axis=1)
     divisor = np.maximum(number, 1)
 

@@ -188,9 +188,9 @@ class _Group:
 
     @cached_property
     def _out(self) -> Booleans:
-        """[V] True for photos with at least half of their observed points outside.
+        """[V] True for photos with more than half of their observed points outside the image.
 
-        Without tracks, True if all points are outside.
+        Without tracks, True if all points of the scene are outside the image.
         """
         if self.evidence.tracked:
             return np.asarray(self.agreement.share < _IN_FRAME)
@@ -383,7 +383,8 @@ class _Group:
             evidence = self.evidence.chosen(np.full(len(others), row))
             agreement = evidence.agreement(replace(evidence.rig, photos=others))
             fit = scores(agreement, tracked=self.evidence.tracked)
-            # A photo with few points inside may fit by chance, because many photos are tried.
+            # Leave out photos with few projected points. Such a photo could fit by chance, because
+            # the camera is compared with many photos.
             fit[(others == self.views[row]) | (agreement.inside < _FEWEST_TESTED)] = 0.0
             if self._fits(fit.max(keepdims=True), np.array([row]))[0]:
                 fitting.append(row)

@@ -18,11 +18,12 @@ from torch import Tensor
 from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.testing.support.contract import require
 
-#: Number of steps in the first test. In this many steps, a state of fixed size reaches its full
-#: size.
+#: Number of steps that `require_bounded` checks first. The check passes if the state does not grow
+#: in the second half of these steps.
 _FEW = 16
-#: Number of steps in each of the three windows of the second test. A state that covers fewer recent
-#: steps than this number has already stopped growing.
+#: If the state grows, `require_bounded` compares the largest sizes in three windows. Each window
+#: has this number of steps. A state that stores fewer recent steps than this number stops growing
+#: in the first window.
 _WINDOW = 1000
 
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 #: Largest number of deferred steps of a row. The limit keeps the tables of steps short.
 LONGEST: Final = 256
 #: If at least this share of the rows has a gradient, all rows take the step in memory order.
-#: Deferred updates of so many rows would take longer.
+#: With a larger share, deferred updates would take longer.
 MOST_ROWS: Final = 0.15
 #: With a smaller beta2, second moments may become 0 before the kernel checks the parameters again.
 LEAST_BETA2: Final = 0.5

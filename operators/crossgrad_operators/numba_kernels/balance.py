@@ -336,9 +336,10 @@ def geometric_mean(values: Floats) -> float:
 def nash(
     gramians: Floats, rounding_residuals: Floats, present: Flags, unit: float, exact: Exact
 ) -> Solved:
-    """Return weights alpha with G alpha = 1 / alpha, multiplied by the geometric mean of the norms.
+    """Return the Nash-MTL weights, multiplied by the geometric mean of the gradient norms.
 
-    `imtl_g` describes the arguments and results.
+    The weights alpha solve G alpha = 1 / alpha with the Gramian G. `imtl_g` describes the
+    arguments and results.
     """
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)

@@ -93,12 +93,12 @@ def dot(a: Sequence[Number], b: Sequence[Number]) -> Number:
 
 
 def apply(matrix: Matrix, x: Sequence[Number]) -> Vector:
-    """Return the product M x."""
+    """Return the product of the matrix and the vector x."""
     return [dot(row, x) for row in matrix]
 
 
 def form(matrix: Matrix, x: Sequence[Number]) -> Number:
-    """Return the quadratic form x^T M x."""
+    """Return the quadratic form x^T M x of the matrix M."""
     return dot(x, apply(matrix, x))
 
 

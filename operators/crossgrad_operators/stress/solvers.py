@@ -117,7 +117,7 @@ def _shortest_solution(gramian: Matrix, n: Vector, rank: int) -> Vector:
 
 
 def nash(question: Question) -> Vector:
-    """Return the weights from the solution of C beta = 1 / beta.
+    """Return the Nash-MTL weights, from the solution beta of C beta = 1 / beta with cosines C.
 
     The weights are multiplied by the geometric mean of the norms.
     """
