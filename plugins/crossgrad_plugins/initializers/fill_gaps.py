@@ -156,8 +156,7 @@ class Filled(Initializer):
         margin: int,
         seen: "_Pictures | None",
     ) -> None:
-        """Fill cells of a photo without points, or cells beyond its edges that `seen` does not
-        show.
+        """Fill cells without points in a photo, or cells beyond its edges that `seen` does not show.
 
         A point on a ray that goes up could float in the air near a camera. Inside the photo, a
         floating point is moved to the sky. Beyond the edges of the photo, a floating point is left
@@ -193,9 +192,7 @@ def _spread(views: Sequence[View], most: int) -> list[View]:
 
 
 def _spacings(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return [P] root mean square distances of the points to their nearest neighbours, as in
-    3DGS.
-    """
+    """Return [P] root mean square distances of the points to their nearest neighbours, as in 3DGS."""
     from scipy.spatial import cKDTree
 
     count = min(_NEAREST, len(points) - 1)
@@ -320,9 +317,7 @@ class _Pictures:
     def _seen(
         self, points: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Return [V, N, 2] pixels times depth, [V, N] depths, and [V, N] True for points in the
-        image.
-        """
+        """Return [V, N, 2] pixels times depth, [V, N] depths, and [V, N] True if in the image."""
         homogeneous = np.column_stack([points, np.ones(len(points))])
         around = np.einsum("vij,nj->vni", self.matrices, homogeneous)
         pixels, depth = around[..., :2], around[..., 2]
