@@ -1,4 +1,4 @@
-"""Square cells over a photo and beyond its edges: their mean colours, and their coverage by points."""
+"""Square cells over a photo and beyond its edges: their mean colours and their coverage."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -40,7 +40,7 @@ class Cells:
 
     @cached_property
     def places(self) -> NDArray[np.int64]:
-        """[C, 2] column and row of each cell; the first cell on the photo has column 0 and row 0."""
+        """[C, 2] column and row of each cell; the photo's first cell is (0, 0)."""
         rows, columns = (np.arange(-self.margin, count + self.margin) for count in self.inner)
         down, across = np.meshgrid(rows, columns, indexing="ij")
         return np.column_stack([across.ravel(), down.ravel()])
@@ -82,7 +82,7 @@ class Cells:
         return means.round().astype(np.uint8)[down, across], pixels[down, across, 0] > 0
 
     def _sums(self, image: NDArray[np.uint8]) -> NDArray[np.uint64]:
-        """Return the sums of an image [H, W, channels] over its cells, [rows, columns, channels]."""
+        """Return [rows, columns, channels] sums of an image [H, W, channels] over its cells."""
         down, across = (
             np.floor(np.arange(count) * self.size).astype(np.int64) for count in self.inner
         )
@@ -108,7 +108,7 @@ class Cells:
     def _under_small(
         self, pixels: NDArray[np.float64], radii: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
-        """Return [C], True if the discs in a cell fill at least the share `_COVERED` of its area."""
+        """Return [C], True if the discs in a cell fill the share `_COVERED` of its area."""
         rows, columns = (count + 2 * self.margin for count in self.inner)
         across, down = np.floor(np.clip(pixels / self.size, -1e6, 1e6)).astype(np.int64).T
         across, down = across + self.margin, down + self.margin

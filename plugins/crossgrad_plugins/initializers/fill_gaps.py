@@ -156,7 +156,7 @@ class Filled(Initializer):
         margin: int,
         seen: "_Pictures | None",
     ) -> None:
-        """Fill cells without points in a photo, or cells beyond its edges that `seen` does not show.
+        """Fill empty cells of a photo, or cells beyond its edges that `seen` does not show.
 
         A point on a ray that goes up could float in the air near a camera. Inside the photo, a
         floating point is moved to the sky. Beyond the edges of the photo, a floating point is left
@@ -192,7 +192,7 @@ def _spread(views: Sequence[View], most: int) -> list[View]:
 
 
 def _spacings(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return [P] root mean square distances of the points to their nearest neighbours, as in 3DGS."""
+    """Return [P] root mean square distances of points to their neighbours, as in 3DGS."""
     from scipy.spatial import cKDTree
 
     count = min(_NEAREST, len(points) - 1)

@@ -254,7 +254,7 @@ def _matched(
 
 
 def _projection(camera: Camera) -> NDArray[np.float64]:
-    """Return [3, 4] the projection of homogeneous points of the local frame to homogeneous pixels."""
+    """Return [3, 4] the projection of homogeneous local points to homogeneous pixels."""
     return np.asarray((camera.matrix @ camera.world_to_camera[:3]).numpy())
 
 

@@ -92,7 +92,7 @@ class GradNorm(Auto):
 
 
 class ConfGate(Auto):
-    """A near and a far view per step, combined by the gate that uses the confidence of a conflict."""
+    """A near and a far view per step, combined by the gate on a conflict's confidence."""
 
     settings: ClassVar[Mapping[str, Any]] = {**PAIRS, "operator": "confgate"}
 

@@ -38,7 +38,7 @@ class Dropout(Rule):
 
 
 def _draws(rng: np.random.Generator, count: int, device: torch.device) -> Tensor:
-    """Return [N] uniform numbers in [0, 1); they are drawn on the device, because the CPU is slow."""
+    """Return [N] uniform numbers in [0, 1), drawn on the device of the Gaussians."""
     if device.type == "cpu":
         return torch.from_numpy(rng.random(count, dtype=np.float32))
     generator = torch.Generator(device).manual_seed(int(rng.integers(1 << 63)))
