@@ -18,15 +18,15 @@ from crossgrad_plugins.georeference.frames import SAME, Frame3D
 from crossgrad_plugins.georeference.projection import Projection, utm_code
 from crossgrad_plugins.rasterizers.reference.harmonics import harmonics
 
-#: Number of directions in which the spherical harmonics of a rotated frame are compared. It is more
-#: than twice the number of harmonics.
+#: Number of directions in which the spherical harmonics before and after a rotation are compared.
+#: The number is more than twice the number of harmonics, so the fit is well conditioned.
 _DIRECTIONS = 48
 
 
 def turned(gaussians: Gaussians, means: Tensor, rotation: Tensor) -> Gaussians:
-    """Return Gaussians with new centres [N, 3]; all are rotated by one rotation [3, 3] float64.
+    """Return Gaussians with new centres [N, 3], all rotated by one rotation [3, 3] (float64).
 
-    A camera that is moved in the same way sees the same image.
+    A camera that is moved and rotated with the Gaussians sees the same image.
     """
     x, y, z, w = Rotation.from_matrix(rotation.cpu().numpy()).as_quat().tolist()
     quats = _product((w, x, y, z), gaussians.quats)
@@ -38,7 +38,7 @@ def turned(gaussians: Gaussians, means: Tensor, rotation: Tensor) -> Gaussians:
 
 
 def _product(first: tuple[float, ...], second: Tensor) -> Tensor:
-    """Return the quaternions [N, 4] wxyz of a rotation by `second` [N, 4], then by `first`."""
+    """Return [N, 4] quaternions of two rotations: by `second` [N, 4], then by `first`."""
     w, x, y, z = first
     rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
     return second @ torch.tensor(rows, dtype=torch.float64).T.to(second)
@@ -47,8 +47,8 @@ def _product(first: tuple[float, ...], second: Tensor) -> Tensor:
 def _harmonics_turn(rotation: Tensor, degree: int) -> Tensor:
     """Return the matrix [B, B], float64, that rotates coefficients of bands 1 to `degree`.
 
-    The harmonics of a rotated direction are linear in the harmonics of the direction, with an
-    orthogonal matrix for each band. The matrix is fitted to the values of the harmonics in enough
+    The harmonics of a rotated direction are linear combinations of the harmonics of the direction;
+    each band has one orthogonal matrix. The matrix is fitted to the values of the harmonics in many
     directions.
     """
     directions = _directions()
@@ -67,8 +67,8 @@ def _directions() -> Tensor:
     return unit
 
 
-#: Statistics of the distances between photos and their GPS positions in metres: in 3-D, along the
-#: ground, and vertically.
+#: Root mean square distances between photos and their GPS positions, in metres: in 3D, horizontal
+#: and vertical.
 RESIDUALS: Final = ("median", "rms", "max", "rms_horizontal", "rms_vertical")
 _CONVENTION: Final = (
     "position = numbers of the file + offset; [east, north, up, 1] = transform [position, 1], "
@@ -82,14 +82,16 @@ class OnEarth:
     """A scene with a known position on Earth.
 
     Attributes:
-        origin: The origin of east, north, up.
-        to_enu: Maps the coordinates of the scene's input to metres east, north and up from the
+        origin: The origin of the coordinates east, north and up.
+        to_enu: Conversion from the coordinates of the input to metres east, north and up of the
             origin.
-        source: The source of the georeference.
-        residuals: Name from `RESIDUALS` -> metres; empty if there was nothing to compare.
-        system: The coordinate system of the input, if the input is in map coordinates. Map
-            coordinates are not a similarity of east, north, up: the coordinate system converts the
-            centres, and `to_enu` is the best fit at the origin.
+        source: The source of the georeference, as text.
+        residuals: Name from `RESIDUALS` -> metres; empty if there was no GPS position to compare
+            with.
+        system: The coordinate system of the input, or None if the input has no map coordinates. The
+            conversion from map coordinates to east, north and up is not a similarity. The
+            coordinate system therefore converts the centres, and `to_enu` is the best similarity at
+            the origin.
     """
 
     origin: Place
@@ -100,7 +102,7 @@ class OnEarth:
 
     @property
     def note(self) -> str:
-        """One sentence for the user; see `crossgrad_core.plugin.Georeference`."""
+        """One sentence about the georeference; see `crossgrad_core.plugin.Georeference`."""
         parts = [f"{name.replace('_', ' ')} {m:.2f} m" for name, m in self.residuals.items()]
         residual_text = f"; residuals: {', '.join(parts)}" if parts else ""
         return (
@@ -109,7 +111,7 @@ class OnEarth:
         )
 
     def placed(self, gaussians: Gaussians, similarity: Similarity, coordinates: str) -> Placed:
-        """See `crossgrad_core.plugin.Georeference`."""
+        """Return the model in map coordinates; see `crossgrad_core.plugin.Georeference`."""
         facts = {**self._facts(), "coordinates": coordinates}
         centers = similarity.to_input(_means(gaussians))
         here = self._enu_of(centers)
@@ -135,7 +137,7 @@ class OnEarth:
         return replace(placed, notes=projection.messages)
 
     def _enu_of(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Convert points [N, 3] of the input to metres east, north, up from the origin [N, 3]."""
+        """Convert points [N, 3] of the input to metres east, north and up of the origin."""
         if self.system is None:
             return self.to_enu.points(points)
         return self.origin.to_enu.points(self.system.geocentric(points))
@@ -148,10 +150,11 @@ class OnEarth:
         points: NDArray[np.float64],
         facts: dict[str, Json],
     ) -> Placed:
-        """Return Gaussians at `points` [N, 3], rotated and scaled by a similarity from the input.
+        """Return Gaussians at `points` [N, 3].
 
-        The Gaussians get a separate frame, which is rotated against the local frame and has the
-        same size, so that an exporter only moves and scales them.
+        A similarity from the input frame rotates and scales them. The Gaussians get a new frame
+        with the size of the local frame and another rotation, so that an exporter only has to move
+        and scale them.
         """
         offset = frame.points(similarity.offset[None])[0]
         frame_similarity = Similarity(offset, similarity.scale / frame.scale)
@@ -160,7 +163,7 @@ class OnEarth:
         return Placed(moved, frame_similarity, {**facts, **self._ways(frame)})
 
     def _facts(self) -> dict[str, Json]:
-        """Return the facts that hold in any coordinates."""
+        """Return the facts that are true in any coordinate system."""
         residuals: dict[str, Json] = dict(self.residuals)
         return {
             "crs": None,
@@ -171,7 +174,7 @@ class OnEarth:
         }
 
     def _ways(self, frame: Frame3D) -> dict[str, Json]:
-        """Return the matrices of a file in the coordinates to which `frame` maps the input."""
+        """Return a file's matrices, for the coordinates to which `frame` converts the input."""
         back = frame.inverse
         to_enu = self.to_enu.after(back)
         return {
@@ -186,9 +189,9 @@ def _means(gaussians: Gaussians) -> NDArray[np.float64]:
 
 
 def _apart(points: NDArray[np.float64], others: NDArray[np.float64]) -> float | None:
-    """Return the distance between two sets of points [N, 3]; None without finite distances.
+    """Return the distance between two sets of points [N, 3]; None if no distance is finite.
 
-    The distance is the 99th percentile, because the farthest points may be at the horizon.
+    The 99th percentile of the distances is used, because the farthest points may be at the horizon.
     """
     off = np.linalg.norm(points - others, axis=1)
     off = off[np.isfinite(off)]
