@@ -85,8 +85,8 @@ def _kept(image: Tensor, mask: Tensor | None) -> Bytes:
 def _fit(render: Bytes, photo: Bytes) -> tuple[Floats, Floats]:
     """Return matrix [3, 3] and offset [3] that bring the render closest to the photo.
 
-    The mapped colours are `render @ matrix + offset`. Render and photo are given as [N, 3] colours. If several maps are equally close, the map with
-    the smallest matrix is used.
+    The mapped colours are `render @ matrix + offset`. Render and photo are given as [N, 3] colours.
+    If several maps are equally close, the map with the smallest matrix is used.
     """
     sums = _sums(render, photo)
     within, across = _spread(sums, slice(0, 3)), _spread(sums, slice(3, 6))
