@@ -115,7 +115,7 @@ class Sweep:
         self.layout = Layout((request.out or SWEEPS / (grid.name or request.path.stem)).absolute())
         if (
             not read_only
-            # Check the lock before planning, because planning takes time. The lock itself is acquired
+            # Check the lock before planning, because planning takes time. The lock is acquired
             # later.
         ):
             _refuse_a_second(self.layout.out)
