@@ -33,7 +33,7 @@ from crossgrad_plugins.groupings.split import (
 
 
 class Radial(Grouping):
-    """near: cameras up to the median distance from the mean training camera; far: the others.
+    """near: cameras up to the median distance from the mean training camera; far: all others.
 
     Source: the paper, median radial split; Otsu's threshold was added for crossgrad.
     """
@@ -54,7 +54,7 @@ class Radial(Grouping):
 class Percentile(Grouping):
     """near: cameras up to the q-th percentile of the distance from the mean camera.
 
-    Far: the others. Balanced pairs then estimate (near mean + far mean) / 2 instead of the mean
+    All other cameras are far. Balanced pairs then estimate (near mean + far mean) / 2 instead of the mean
     over all cameras. If q is not 50, these two means differ, so the run trains another objective.
 
     Source: the paper, partition threshold study (30 and 70).

@@ -183,8 +183,8 @@ def _blend(
     """Blend one Gaussian into the patches that it reaches.
 
     Returns:
-        The number of blended pixels, and the patches without those that turned out to be out of
-        reach.
+        The number of blended pixels, and the patches
+        that the Gaussian reaches.
     """
     left = rest = reached
     decay = broadcast_wide(records, record + DECAY)
