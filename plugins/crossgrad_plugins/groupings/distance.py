@@ -54,8 +54,9 @@ class Radial(Grouping):
 class Percentile(Grouping):
     """near: cameras up to the q-th percentile of the distance from the mean camera.
 
-    All other cameras are far. Balanced pairs then estimate (near mean + far mean) / 2 instead of the mean
-    over all cameras. If q is not 50, these two means differ, so the run trains another objective.
+    All other cameras are far. Balanced pairs then estimate (near mean + far mean) / 2 instead of
+    the mean over all cameras. If q is not 50, these two means differ, so the run trains another
+    objective.
 
     Source: the paper, partition threshold study (30 and 70).
     """

@@ -33,11 +33,11 @@ from crossgrad_plugins.groupings.split import (
 class Footprint(Grouping):
     """near: views that show a local unit with at least the median number of pixels.
 
-    All other views are far. The footprint of a view is the median of f/z over the SfM points that the view
-    observed; f is the focal length and z is the depth. If the view observed fewer than three
-    points, all SfM points inside its image are used. If the image contains no points either, the
-    view gets the footprint of the nearest training camera that has one. The footprint depends on
-    the focal length, and does not assume that the cameras surround a centre.
+    All other views are far. The footprint of a view is the median of f/z over the SfM points that
+    the view observed; f is the focal length and z is the depth. If the view observed fewer than
+    three points, all SfM points inside its image are used. If the image contains no points either,
+    the view gets the footprint of the nearest training camera that has one. The footprint depends
+    on the focal length, and does not assume that the cameras surround a centre.
 
     Source: the paper, projected footprint; Otsu's threshold and the fallbacks were added for
     crossgrad.

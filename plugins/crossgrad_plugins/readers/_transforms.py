@@ -115,9 +115,10 @@ def transform_of(fields: Fields, key: str) -> NDArray[np.float64]:
 def read_lens(inside: Inside, frame: Fields, whole: Fields, photo: str) -> Calibration:
     """Return the lens parameters of a frame.
 
-    If the file gives no image size, the size of the photo is used. A field of the frame overrides the
-    field of the file with this name. Some quantities can be given by different fields. If the frame gives a quantity, the file's other fields
-    for this quantity are ignored, because they describe another lens.
+    If the file gives no image size, the size of the photo is used. A field of the frame overrides
+    the field of the file with this name. Some quantities can be given by different fields. If the
+    frame gives a quantity, the file's other fields for this quantity are ignored, because they
+    describe another lens.
 
     Raises:
         UserError: A field is missing or wrong, or the lens cannot be undistorted.
