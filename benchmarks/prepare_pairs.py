@@ -105,7 +105,7 @@ def fundamental(truth: Poses, intrinsics: dict[str, Matrix], first: str, second:
 
 
 def table(pairs: list[Pair]) -> Iterator[str]:
-    """Yield a table by folders and number of matches: pairs, and how many of them are wrong."""
+    """Yield a table of pairs and wrong pairs, by folders and number of matches."""
     titles = [f"{low} to {high - 1}" for low, high in itertools.pairwise(BOUNDS)]
     titles.append(f"{BOUNDS[-1]} and more")
     yield "| folders | " + " | ".join(titles) + " |"

@@ -2,10 +2,10 @@
 
     python benchmarks/sweep.py [SCENE] [--runs 6] [--steps 400] [--max-size 400] [--workers 2]
 
-The program times three sweeps of the same runs: in sequence with one thread, in sequence with one
-thread per worker, and with all workers at the same time with one thread each. For comparison, it
-also times the same number of simultaneous `crossgrad run` processes, and a single process. The
-results are only meaningful on a machine without other work.
+The program times three sweeps of the same runs. The first uses one thread, in sequence. The second
+uses one thread per worker, in sequence. The third uses all workers at the same time, with one
+thread each. For comparison, it also times the same number of simultaneous `crossgrad run`
+processes, and a single process. The results are only meaningful on a machine without other work.
 """
 
 import argparse

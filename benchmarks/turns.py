@@ -31,7 +31,7 @@ WARM_UP = 4
 
 
 class Worker:
-    """A process that takes a step of a checkout when it is asked to.
+    """A process that takes a step of a checkout on request.
 
     Args:
         checkout: Folder of the checkout.

@@ -162,8 +162,8 @@ def _along_the_true_gap(draws: Resamples, gap: float, floor: float) -> float:
     The sample gap d is the true gap plus noise. The noise is largest in the directions in which
     gradients vary most. Let Sigma be the covariance of the difference of the means. Noise adds
     tr(Sigma^2), which is half of the `floor`, to d' Sigma d, and adds tr(Sigma) to |d|^2. Only half
-    of each term is subtracted, because the terms are uncertain with a dozen views. Less is
-    subtracted if the whole gap could be noise.
+    of each term is subtracted, because the terms are uncertain with a dozen views. A smaller part
+    is subtracted if the whole gap could be noise.
 
     Without the subtraction, 95 % intervals of sigma_b^2 contain the true value in up to 99.5 % of
     the cases if few directions dominate. With the full subtraction, they contain it in 84 to 97 %

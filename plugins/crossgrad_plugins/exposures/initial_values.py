@@ -147,9 +147,9 @@ def _some(names: Sequence[str]) -> str:
 class Neighbours:
     """Predictions of a photo's values from the photos with similar camera poses.
 
-    The squared distance of two cameras is the sum of two terms: the squared distance of their
-    centres in units of the median distance from the middle, and the squared distance of their unit
-    viewing directions.
+    The squared distance of two cameras is the sum of two terms. The first is the squared distance
+    of their centres, in units of the median distance from the middle. The second is the squared
+    distance of their unit viewing directions.
     """
 
     def __init__(self, views: Sequence[View]) -> None:

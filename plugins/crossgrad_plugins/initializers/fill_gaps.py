@@ -22,9 +22,9 @@ _NEAREST: Final = 3
 #: A point is hidden in a photo if its depth is larger than this multiple of the photo's depth at
 #: its pixel.
 _BEHIND: Final = 1.5
-#: A photo shows the ground below a camera if two conditions hold: the camera's depth in the photo
-#: is at least `_GROUND` times the photo's depth at that pixel, and the ray to the camera goes down
-#: with a sine of at least `_STEEP`.
+#: A photo shows the ground below a camera if two conditions hold. The camera's depth in the photo
+#: is at least `_GROUND` times the photo's depth at that pixel. The ray to the camera goes down with
+#: a sine of at least `_STEEP`.
 _GROUND, _STEEP = 0.75, 0.3
 #: Number of points from which the extent of the scene is computed, and the share of them that are
 #: not outliers.

@@ -23,8 +23,9 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-#: Two limits: the minimum number of points for a pose, as in COLMAP's incremental mapping; and the
-#: minimum number of points that two photos of a model share, directly or through other photos.
+#: Two limits. The first is the minimum number of points for a pose, as in COLMAP's incremental
+#: mapping. The second is the minimum number of points that two photos of a model share, directly or
+#: through other photos.
 _POINTS, _SHARED = 30, 15
 
 

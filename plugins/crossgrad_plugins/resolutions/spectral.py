@@ -174,7 +174,7 @@ def kept_shares(views: Sequence[View]) -> Floats:
 
     The scales are 0, 1 / GRID .. 1, and the share at scale 1 / r is X(F_r) / X(F). X(F) is the sum
     of the amplitudes |DFT| over all frequencies of the grey photos. X(F_r) is the sum over the
-    frequencies up to 1 / r of the highest frequency, in x and in y; a photo at 1 / r of the size
+    frequencies up to 1 / r of the highest frequency, in x and in y. A photo at 1 / r of the size
     contains these frequencies. Each photo is processed by one thread, and the sums follow the order
     of the photos. The result therefore does not depend on the number of threads. If all amplitudes
     of the photos are zero, the share is 1 at every scale.

@@ -1,10 +1,10 @@
 """Gains in linear light on sRGB values, and their gradients (CPU, float32, one thread).
 
 The sRGB curve is linear for dark values, and a power function above them. If a value x is in the
-power part before and after the gain G, all steps together are one linear map: x -> G^(1/2.4) (x +
-o) - o with o = 0.055. If x is in the linear part before and after the gain, the map is x -> G x.
-Only values that move from one part to the other need a power function. Such values are searched for
-in blocks of eight.
+power part before and after the gain G, the whole computation is one linear map. The map is x ->
+G^(1/2.4) (x + o) - o with o = 0.055. If x is in the linear part before and after the gain, the map
+is x -> G x. Only values that move from one part to the other need a power function. Such values are
+searched for in blocks of eight.
 """
 
 from typing import TypeAlias

@@ -162,7 +162,7 @@ def sh_backward(
             not needed.
         v_means: [N, 3] gradients to which the gradients of the centres are added.
         wanted: Two flags. The first flag is True if `v_dc` and `v_rest` have one row per record, in
-            the order of the records; such rows are written completely and need not be zero at the
+            the order of the records. Such rows are written completely and need not be zero at the
             start. The second flag is True if `v_rest` is needed.
     """
     dc_by_rows, rest_by_rows, learns = wanted
