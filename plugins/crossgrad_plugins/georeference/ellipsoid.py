@@ -33,7 +33,7 @@ class Place:
 
     @property
     def to_enu(self) -> Frame3D:
-        """The conversion from geocentric coordinates to metres east, north and up from here."""
+        """The conversion from geocentric coordinates to east, north and up of this position."""
         sine, cosine, sine_l, cosine_l = (
             *(math.sin(math.radians(self.latitude)), math.cos(math.radians(self.latitude))),
             *(math.sin(math.radians(self.longitude)), math.cos(math.radians(self.longitude))),
