@@ -126,7 +126,7 @@ def in_empty_space(positions: NDArray[np.float64], scene: Scene, empty: float) -
         empty: Radius of the empty space around a camera, as a share of the distance to the nearest
             point that the camera sees.
     """
-    from scipy.spatial import cKDTree  # Import the tree here, because its module loads slowly.
+    from scipy.spatial import cKDTree  # Import the k-d tree here, because SciPy's module loads slowly.
 
     views = cameras_that_tell(scene)
     if not views:
