@@ -40,7 +40,7 @@ def test_every_operator_obeys_every_law(name, law):
     assert error is None or error <= 8
 
 
-@pytest.mark.sampled(6)
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", GRAMIAN)
 @DRAWN
 @given(data=st.data())

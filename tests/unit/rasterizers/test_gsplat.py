@@ -136,6 +136,7 @@ def test_gsplat_differs_from_the_default_only_by_its_alpha_cap_of_0_999(gsplat):
     assert 0.0 < (theirs - ours).max() <= 0.0091
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 @pytest.mark.parametrize("band", [1 << 19, 3 * 37])
 def test_gsplat_pixel_counts_agree_with_the_reference(gsplat, monkeypatch, camera, band):
