@@ -25,6 +25,8 @@ from crossgrad_core.run.results.curve import draw_curve
 
 #: Their kernels take longest to compile and have none in common; many others share theirs.
 HEAVIEST = ("rasterizers-numba-", "operators-cagrad-")
+#: Components of which two processes would compile the same kernels at the same time.
+SAME_KERNELS = ("[rules-", "[densifiers-multiview")
 CONTRACTS, MATRIX, FAULTS = "test_contracts.py", "tests/matrix/", "tests/faults/"
 GUARDS = "guards"
 
@@ -39,7 +41,9 @@ class ByFileOrComponent(LoadFileScheduling):
 
     def _split_scope(self, nodeid):
         if CONTRACTS in nodeid:
-            return nodeid.rpartition("-")[0]
+            component = nodeid.rpartition("-")[0]
+            together = (each for each in SAME_KERNELS if each in component)
+            return next(together, component)
         if MATRIX in nodeid:
             return nodeid.partition(" x ")[0]
         if nodeid.startswith(FAULTS) and "FAULTS" not in os.environ:
@@ -138,6 +142,14 @@ def _unsynced():
     """Nothing here cuts the power; waiting for the disk took up to a tenth of the tests of runs."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda _: None)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _compiling_alone():
+    """A run starts no second process for its first missing kernel: the tests use every core."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("crossgrad_core.training.start.available_cores", lambda: 1)
         yield
 
 
