@@ -70,6 +70,7 @@ def test_cross_capture_leaves_training_photos_out_and_repeats_held_out_metrics(
     assert "street" in printed and "left out: 7 views" in printed
 
 
+@pytest.mark.slow
 def test_a_ply_has_the_same_cross_capture_metrics_as_the_model(trained, scene, capsys):
     model, _ = evaluate.evaluated_on(trained, scene)
     before = sorted(trained.rglob("*"))

@@ -56,7 +56,7 @@ def same(a, b):
 OBSERVER = {"name": "diagnostics", "every": 6, "views": 4}
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
     [
@@ -77,6 +77,7 @@ def test_the_diagnostics_observer_changes_no_bit_of_the_training(scene, tmp_path
     assert sorted({int(row["step"]) for row in table(tmp_path / "watched")}) == [6, 12]
 
 
+@pytest.mark.slow
 def test_a_gradient_probe_uses_the_grouping_of_the_run(scene, tmp_path):
     settings = {"sampler": {"name": "near-far"}, "grouping": {"name": "lists"}}
     run(scene, tmp_path / "run", observers=[OBSERVER], **settings)

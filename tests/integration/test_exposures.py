@@ -322,7 +322,7 @@ def with_exif(path, stops):
     path.unlink()
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("model", with_long("gain"))
 def test_exif_gives_initial_exposures_and_predicts_unseen_photos(varied, tmp_path, model):
     folder = tmp_path / "scene"

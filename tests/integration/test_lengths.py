@@ -206,6 +206,7 @@ def test_runs_with_one_and_two_views_per_step_edit_after_the_same_views():
     assert max(one.edits) < 72
 
 
+@pytest.mark.slow
 def test_schedule_unit_steps_counts_events_in_steps():
     setup, _, seen = trained(views=2, steps=72, schedule_unit="steps")
     assert seen.edits == [] and setup.schedule.densify_from == 500

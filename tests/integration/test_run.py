@@ -110,6 +110,7 @@ def test_a_stopped_run_continues_bit_for_bit(scene, tmp_path, sampler):
     assert rows == quality(tmp_path / "whole")
 
 
+@pytest.mark.slow
 def test_an_averaged_run_resumes_bit_for_bit_and_exports_the_average(scene, tmp_path):
     settings = {"steps": 20, "eval_every": 4}
     tail = {"lr-tail": {"share": 0.5}}
@@ -234,7 +235,7 @@ def in_place(scene, tmp_path_factory):
     return out
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1000.0, 0.001])
 def test_the_unit_of_length_of_a_scene_does_not_change_the_result(in_place, tmp_path, scale):
     write_tiny_scene(tmp_path / "scaled", views=9, scale=scale)

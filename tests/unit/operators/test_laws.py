@@ -61,6 +61,7 @@ def test_results_for_any_gradients_are_finite_and_independent_of_scale(
         np.testing.assert_array_equal(weights, results[1])
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", UNORDERED)
 @DRAWN
 @given(data=st.data())

@@ -86,7 +86,7 @@ def test_mgda_is_at_least_as_good_as_torchjd(views, ask):
         assert ((found - expected) ** 2).sum() <= excess + 1e-12 * (expected @ expected)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("views", VIEWS)
 def test_mgda_agrees_with_torchjd_if_every_view_has_a_positive_weight(views, ask):
     """The Frank-Wolfe method converges fast if the shortest point is far inside the convex hull."""

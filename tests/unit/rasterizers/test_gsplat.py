@@ -205,6 +205,7 @@ def test_an_empty_model_gives_the_background(gsplat):
     assert first.screen.mean_gradient.shape == first.screen.abs_gradient.shape == (0, 2)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("taken_back", [False, True])
 def test_a_deleted_render_frees_its_memory(gsplat, monkeypatch, taken_back):
     centers = []
