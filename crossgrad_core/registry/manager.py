@@ -222,7 +222,10 @@ def _refuse_misspelt_hooks(manager: pluggy.PluginManager, name: str, plugin: obj
 
     `check_pending` sees only marked methods and does not suggest a name.
     """
+    may_be_hooks = _may_be_hooks(plugin)
     for attribute in dir(plugin):
+        if attribute not in may_be_hooks and not attribute.startswith(_PREFIX):
+            continue
         options = manager.parse_hookimpl_opts(plugin, attribute)
         if options is None:
             if attribute.startswith(_PREFIX) and _is_function(plugin, attribute):

@@ -87,7 +87,7 @@ def test_changed_settings_are_refused_even_without_the_plugins(run, capsys):
     )
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("old", "new", "named"),
     [

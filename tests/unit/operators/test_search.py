@@ -78,6 +78,7 @@ class Absolute(GramianOperator):
         return np.eye(gramians.shape[1]) * np.where(long, 1.0, 2.0)[:, :, None], state
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("dtype", BOTH, ids=str)
 def test_the_operator_search_finds_an_operator_that_is_seldom_slightly_wrong(dtype):
     (tally,) = search([symmetric_as(SeldomOff())], Extent(rounds=4, dtypes=(dtype,)))
@@ -85,6 +86,7 @@ def test_the_operator_search_finds_an_operator_that_is_seldom_slightly_wrong(dty
     assert "u kappa" in tally.failures[0][1]
 
 
+@pytest.mark.slow
 def test_the_operator_search_finds_an_operator_that_rarely_returns_nan():
     found = run_finite(symmetric_as(SeldomNan()), 20_000)
     assert found.not_finite > 0
