@@ -13,8 +13,8 @@ from crossgrad_plugins.planner.modes import FEWEST, LEAST_RATIO, LEAST_SHARE, ON
 if TYPE_CHECKING:
     from crossgrad_plugins.planner.probe import Probe
 
-#: Minimum ratio sigma_b^2 / sigma_w^2 (variance between groups / within groups) for pairs of views.
-#: Pairs reduce the gradient variance of a step by about this share.
+#: Minimum ratio rho = sigma_b^2 / sigma_w^2 (variance between groups / within groups) for pairs of
+#: views. Pairs remove the share rho / (1 + rho) of a step's gradient variance.
 LEAST_RHO: Final = 0.1
 #: Minimum share of the views in the smaller mode for pairs of views. Pairs give both modes equal
 #: weights. With a smaller share, the training objective would change too much.
