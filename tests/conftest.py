@@ -6,9 +6,12 @@ starts in the background.
 """
 
 import gc
+import logging
 import os
 import signal
 from collections import defaultdict
+from contextlib import suppress
+from pathlib import Path
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -22,6 +25,8 @@ from crossgrad_core.run.results.curve import draw_curve
 
 #: Their kernels take longest to compile and have none in common; many others share theirs.
 HEAVIEST = ("rasterizers-numba-", "operators-cagrad-")
+#: Components of which two processes would compile the same kernels at the same time.
+SAME_KERNELS = ("[rules-", "[densifiers-multiview")
 CONTRACTS, MATRIX, FAULTS = "test_contracts.py", "tests/matrix/", "tests/faults/"
 GUARDS = "guards"
 
@@ -36,7 +41,9 @@ class ByFileOrComponent(LoadFileScheduling):
 
     def _split_scope(self, nodeid):
         if CONTRACTS in nodeid:
-            return nodeid.rpartition("-")[0]
+            component = nodeid.rpartition("-")[0]
+            together = (each for each in SAME_KERNELS if each in component)
+            return next(together, component)
         if MATRIX in nodeid:
             return nodeid.partition(" x ")[0]
         if nodeid.startswith(FAULTS) and "FAULTS" not in os.environ:
@@ -76,16 +83,51 @@ def pytest_collection_modifyitems(items):
     items.sort(key=place)
 
 
+@pytest.hookimpl(wrapper=True)
 def pytest_collection():
-    """While tests are collected, nothing becomes garbage; looking for it took a fifth of this."""
+    """While tests are collected, nothing becomes garbage; looking for it took a fifth of this.
+
+    In a fresh checkout, one process compiles the tests and what they import; the others wait, and
+    load it then.
+    """
     gc.disable()
+    compiled = Path(__file__).with_name("contract").glob("__pycache__/test_contracts.*-pytest-*")
+    with Path(__file__).open() as lock:
+        if not any(compiled):
+            with suppress(ImportError):  # On Windows.
+                import fcntl
+
+                try:
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    fcntl.flock(lock, fcntl.LOCK_SH)
+        return (yield)
 
 
 def pytest_collection_finish():
-    """What is there now stays: looking for garbage among a million objects takes a second."""
+    """What is there now stays: looking for garbage among a million objects takes a second.
+
+    Before each phase of each test, pytest visits every logger that does not propagate; torch has
+    forty of them.
+    """
+    for logger in logging.root.manager.loggerDict.values():
+        if isinstance(logger, logging.Logger) and logger.name.partition(".")[0] == "torch":
+            logger.propagate = True
+    forget_garbage()
+
+
+def forget_garbage():
     gc.enable()
+    # Tests and compilers make many objects that stay; looking after every 700 took a twentieth.
+    gc.set_threshold(100_000, 20, 20)
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture(scope="module")
+def few_objects():
+    """Checks of memory look at all objects after each step; what earlier tests left is skipped."""
+    forget_garbage()
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -100,6 +142,14 @@ def _unsynced():
     """Nothing here cuts the power; waiting for the disk took up to a tenth of the tests of runs."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda _: None)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _compiling_alone():
+    """A run starts no second process for its first missing kernel: the tests use every core."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("crossgrad_core.training.start.available_cores", lambda: 1)
         yield
 
 

@@ -12,23 +12,24 @@ extras=${EXTRAS:-test,lint}
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 
-[ -x "$venv/bin/python" ] || "$python" -m venv "$venv"
+fresh=
+[ -x "$venv/bin/python" ] || { "$python" -m venv "$venv"; fresh=yes; }
 pip() { "$venv/bin/python" -m pip --quiet --disable-pip-version-check "$@"; }
 # The pip of a Python from 2023 takes twice the time for each package.
 pip install --upgrade --constraint "$here/constraints.txt" pip build hatchling
+# Bytecode is made when a module is imported, in the tests' environment: most never are.
+unset PYTHONDONTWRITEBYTECODE
+pip install --no-compile --no-deps --constraint "$constraints" torch &
+torch=$!
+"$venv/bin/python" "$here/tests/beside_torch.py" "$extras" >"$work/needs.txt"
+pip install --no-compile --no-warn-conflicts --constraint "$constraints" --requirement "$work/needs.txt"
 "$venv/bin/python" -m build --wheel --no-isolation --outdir "$work/dist" "$here" >"$work/build.log" 2>&1 ||
     { cat "$work/build.log"; exit 1; }
 wheel=$(ls "$work"/dist/crossgrad-*.whl)
-# Bytecode is made when a module is imported, in the tests' environment: most never are.
-unset PYTHONDONTWRITEBYTECODE
-"$venv/bin/python" "$here/tests/beside_torch.py" "$extras" >"$work/needs.txt"
-pip install --no-compile --no-deps --constraint "$constraints" torch &
-torch=$!
-pip install --no-compile --no-warn-conflicts --constraint "$constraints" --requirement "$work/needs.txt"
 wait "$torch"
 pip install --no-compile --constraint "$constraints" "crossgrad[$extras] @ file://$wheel"
 # The version stays the same while the code changes: the wheel itself must always be renewed.
-pip install --force-reinstall --no-deps "$wheel"
+[ -n "$fresh" ] || pip install --no-compile --force-reinstall --no-deps "$wheel"
 
 cd "$work"
 types=

@@ -8,6 +8,7 @@ import pytest
 from crossgrad_faults import laws
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("what", ["rot", "vanish"])
 def test_a_run_whose_photo_is_lost_names_the_photo_and_can_be_resumed(
     reference, thorough, tmp_path, what

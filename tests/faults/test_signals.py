@@ -9,6 +9,7 @@ import pytest
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("number", CODES)
 def test_a_signal_at_any_instant_leaves_a_run_that_can_be_resumed(
     reference, thorough, tmp_path, number

@@ -36,6 +36,7 @@ def ran(monkeypatch, tmp_path):
     return run
 
 
+@pytest.mark.sampled(23)
 @pytest.mark.parametrize(
     "archive", sorted((BENCHMARKS / "results").rglob("*.tar.xz")), ids=lambda path: path.name
 )

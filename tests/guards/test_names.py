@@ -69,5 +69,7 @@ TEXTS = {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path 
 
 @pytest.mark.parametrize("name", WITHDRAWN)
 def test_a_withdrawn_name_is_not_used(name):
-    used = [path for path, text in TEXTS.items() if re.search(rf"\b{name}\b", text)]
+    # To look for a word takes ten times as long as to look for letters.
+    there = [path for path, text in TEXTS.items() if name in text]
+    used = [path for path in there if re.search(rf"\b{name}\b", TEXTS[path])]
     assert not used, f"write {WITHDRAWN[name]} instead of {name}"

@@ -67,6 +67,7 @@ def test_a_run_killed_before_its_metrics_file_is_restarted(whole, killed):
     assert measured(killed) == measured(whole)[:1]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("stop", [1, 2, 10_000])
 def test_a_stop_step_in_the_past_or_after_the_end_is_refused(killed, stop):
     assert app.run({"stop_after": 2}, resume=killed, verbosity=-1) == 0

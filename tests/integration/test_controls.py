@@ -174,6 +174,7 @@ def test_distance_weights_use_a_tenth_of_the_learning_rate_of_their_parameter():
         assert rate == pytest.approx(0.1 * plain[name.removeprefix("distance_")], rel=1e-9), name
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize("views", [1, 2])
 @pytest.mark.parametrize(
     ("length", "settings", "beta2"),
@@ -203,6 +204,7 @@ def test_runs_with_few_passes_use_smaller_adam_betas(length, settings, beta2, vi
     assert rates_at(setup, 1)["scales"] == pytest.approx((2.0 if own else 1.0) * plain, rel=1e-9)
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize(
     ("settings", "beta1"),
     [
@@ -379,6 +381,7 @@ def test_densify_views_one_uses_one_view_per_step_at_alternating_positions():
     assert (state.counters.views, state.counters.backward_passes) == (36, 36)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("views", [1, 2])
 def test_an_extra_view_is_rendered_while_density_control_lasts(views):
     seen = Observed()
@@ -440,6 +443,7 @@ def test_pixel_weights_that_no_loss_can_use_are_refused(change, found):
     assert refused.value.where.startswith("hook crossgrad_pixel_weights of watch0, photo ")
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("operator", ["sum", "pcgrad"])
 @pytest.mark.parametrize("choice", ["one", "extra"])
 def test_densify_views_changes_no_bit_before_the_first_edit(choice, operator):
@@ -458,6 +462,7 @@ def test_densify_views_changes_no_bit_before_the_first_edit(choice, operator):
         assert next(rngs) == next(rngs)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("choice", ["one", "extra"])
 def test_densify_views_changes_the_edits_of_density_control(choice):
     asked = {"views": 2, "min_refinements": 6}

@@ -71,6 +71,7 @@ def test_cross_capture_leaves_training_photos_out_and_repeats_held_out_metrics(
     assert "street" in printed and "left out: 7 views" in printed
 
 
+@pytest.mark.slow
 def test_a_ply_has_the_same_cross_capture_metrics_as_the_model(trained, scene, capsys):
     model, _ = evaluate.evaluated_on(trained, scene)
     before = sorted(trained.rglob("*"))
@@ -141,7 +142,7 @@ def test_captures_that_cannot_be_compared_are_refused(trained, scene, tmp_path):
         evaluate.evaluate(trained, on=only)
     away = {**PLACE, "offset": (4000.0, -20.0, 3.0)}
     far_away = write_tiny_scene(tmp_path / "away", views=3, **away)
-    with pytest.raises(UserError, match=r"does not overlap(.|\n)*0% of its points"):
+    with pytest.raises(UserError, match=r"does not overlap(.|\n)*0% of the capture's points"):
         evaluate.evaluate(trained, on=far_away)
     with pytest.raises(UserError):
         evaluate.evaluate(trained, on=tmp_path / "nothing")
@@ -149,6 +150,7 @@ def test_captures_that_cannot_be_compared_are_refused(trained, scene, tmp_path):
     assert np.isfinite(float(per_view(trained / "per_view.csv")["aerial/0000.png"]["psnr"]))
 
 
+@pytest.mark.slow
 def test_scenes_with_the_same_name_get_separate_tables(trained, scene, tmp_path):
     table = trained / "per_view_on_place.csv"
     evaluate.evaluated_on(trained, scene)
@@ -190,9 +192,10 @@ def test_captures_of_one_place_are_distinguished_from_captures_of_another_place(
     assert _alike(own, surface(2, 20))
 
 
+@pytest.mark.slow
 def test_a_capture_of_another_place_is_measured_with_a_warning(trained, scene, capsys, monkeypatch):
     monkeypatch.setattr(elsewhere_module, "_alike", lambda own, points: False)
     evaluate.evaluate(trained, on=scene)
-    assert "both show the same place" in capsys.readouterr().out
+    assert "the run show the same place" in capsys.readouterr().out
     render.render(trained, split="test", out=None, on=scene)
-    assert "both show the same place" in capsys.readouterr().out
+    assert "the run show the same place" in capsys.readouterr().out

@@ -148,6 +148,7 @@ def compared_tables(folder):
     return csv_tables(comparison, views)
 
 
+@pytest.mark.slow
 @THOROUGH
 def test_comparing_damaged_runs_gives_the_same_tables_or_is_refused(finished, tmp_path, thorough):
     runs = tmp_path / "runs"

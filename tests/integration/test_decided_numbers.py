@@ -14,7 +14,7 @@ def test_the_file_of_recorded_numbers_contains_all_combinations_of_settings():
     assert [name for name, _ in CHOSEN] == [*KNOWN]
 
 
-@pytest.mark.sampled(5)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("first", range(0, len(CHOSEN), CHUNK))
 def test_automatically_chosen_settings_equal_the_recorded_settings(first):
     chunk = CHOSEN[first : first + CHUNK]

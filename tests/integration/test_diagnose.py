@@ -56,7 +56,7 @@ def same(a, b):
 OBSERVER = {"name": "diagnostics", "every": 6, "views": 4}
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
     [
@@ -77,12 +77,14 @@ def test_the_diagnostics_observer_changes_no_bit_of_the_training(scene, tmp_path
     assert sorted({int(row["step"]) for row in table(tmp_path / "watched")}) == [6, 12]
 
 
+@pytest.mark.slow
 def test_a_gradient_probe_uses_the_grouping_of_the_run(scene, tmp_path):
     settings = {"sampler": {"name": "near-far"}, "grouping": {"name": "lists"}}
     run(scene, tmp_path / "run", observers=[OBSERVER], **settings)
     assert {row["grouping"] for row in table(tmp_path / "run")} == {"of the run"}
 
 
+@pytest.mark.slow
 def test_each_gradient_probe_records_its_duration(scene, tmp_path):
     run(scene, tmp_path / "run", steps=4, observers=[{**OBSERVER, "every": 1}])
     probing = {row["step"]: float(row["probe_seconds"]) for row in table(tmp_path / "run")}
@@ -134,6 +136,7 @@ def test_a_finished_run_is_diagnosed_at_its_final_state(scene, tmp_path, capsys)
     assert {row["grouping"] for row in table(tmp_path / "out")} == {"of the run"}
 
 
+@pytest.mark.slow
 def test_a_sampler_can_use_the_labels_of_the_conflict_signature(scene, tmp_path):
     run(scene, tmp_path / "run")
     labels = tmp_path / "labels.csv"
@@ -212,6 +215,7 @@ def diagnosed(scene, out):
     return end.value.code
 
 
+@pytest.mark.slow
 def test_a_failed_training_reports_its_gradient_probes_and_the_reason(
     scene, tmp_path, monkeypatch, capfd
 ):

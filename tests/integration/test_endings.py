@@ -96,7 +96,7 @@ class Broken:
         return answer
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "case",
     [
@@ -146,7 +146,7 @@ def test_a_photo_that_cannot_be_read_at_an_evaluation_keeps_the_run(
     assert_same(out, whole)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "case",
     [
@@ -262,6 +262,7 @@ def test_a_signal_stops_the_run_after_its_step(scene, whole, tmp_path, with_plug
     assert_same(out, whole)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("evaluation", [False, True])
 def test_a_second_signal_skips_evaluation_but_saves_a_checkpoint(
     scene, whole, tmp_path, with_plugin, capsys, evaluation
@@ -392,7 +393,7 @@ class Leaves:
         return DensifyResult(Edit(values={name: Rows(each, rows) for name, each in values.items()}))
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), ZeroDivisionError("by zero")])
 def test_an_error_in_the_removal_of_floaters_loses_no_results(
     scene, tmp_path, with_plugin, monkeypatch, error

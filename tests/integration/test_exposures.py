@@ -69,6 +69,7 @@ def notes(out):
     return " ".join(read_run(out).summary["notes"])
 
 
+@pytest.mark.slow
 def test_exposure_auto_is_off_if_photos_agree_and_changes_no_bit(scene, tmp_path):
     assert run(scene, tmp_path / "none", exposure={"name": "none"}) == 0
     assert run(scene, tmp_path / "auto") == 0
@@ -91,6 +92,7 @@ def test_exposure_auto_selects_gain_if_photos_differ_and_exposure_none_suggests_
     assert "--exposure gain" in notes(tmp_path / "none")
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("model", MODELS)
 def test_each_exposure_model_starts_at_the_measured_values(varied, tmp_path, model):
     assert run(varied, tmp_path / "run", steps=1, exposure={"name": model}) == 0
@@ -110,6 +112,7 @@ def test_each_exposure_model_starts_at_the_measured_values(varied, tmp_path, mod
     assert np.mean(list(values.values()), axis=0) == pytest.approx(neutral, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", with_long("channel"))
 def test_a_resumed_run_ends_with_the_bits_of_an_uninterrupted_run(varied, tmp_path, model):
     settings = {"exposure": {"name": model, "rate": 0.05}, "views_per_step": 3}
@@ -120,6 +123,7 @@ def test_a_resumed_run_ends_with_the_bits_of_an_uninterrupted_run(varied, tmp_pa
     assert photos(tmp_path / "whole") == photos(tmp_path / "broken")
 
 
+@pytest.mark.slow
 def test_an_exposure_learning_rate_of_zero_keeps_the_initial_values(varied, tmp_path):
     kept = {"name": "gain", "rate": 0.0}
     assert run(varied, tmp_path / "one", steps=1, exposure=kept) == 0
@@ -144,6 +148,7 @@ def test_exposure_from_starts_at_the_values_of_another_run(varied, tmp_path):
     assert str(values) in config.read_text()
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("model", ["gain", "affine"])
 def test_photos_missing_from_the_file_keep_their_exposure_relative_to_other_photos(
     varied, tmp_path, model
@@ -239,6 +244,7 @@ def check_extremes(scene, tmp_path, case, model, views):
     assert "because there are no usable tracks and no EXIF data" in notes(tmp_path / "run")
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("case", "model"), [("ten stops", "gain"), ("a black photo", "affine")], ids=" ".join
 )
@@ -256,6 +262,7 @@ def test_all_extreme_photos_give_finite_results_with_all_models(
     check_extremes(scene, tmp_path, case, model, views)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", with_long("gain"))
 def test_gains_of_ten_stops_from_a_file_give_finite_results_and_are_named(varied, tmp_path, model):
     assert run(varied, tmp_path / "first", steps=1, exposure={"name": "gain"}) == 0
@@ -276,6 +283,7 @@ def test_gains_of_ten_stops_from_a_file_give_finite_results_and_are_named(varied
     assert "photos differ by more than 4 stops from the mean" in notes(tmp_path / "run")
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("model", [*with_long("gain"), "auto"])
 def test_photos_without_tracks_start_at_the_exposure_of_their_regime(varied, tmp_path, model):
     folder = tmp_path / "scene"
@@ -314,7 +322,7 @@ def with_exif(path, stops):
     path.unlink()
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("model", with_long("gain"))
 def test_exif_gives_initial_exposures_and_predicts_unseen_photos(varied, tmp_path, model):
     folder = tmp_path / "scene"

@@ -120,7 +120,7 @@ CASES = {
 }  # fmt: skip
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_a_resumed_run_ends_with_the_bits_of_an_uninterrupted_run(scene, tmp_path, case):
     settings = {**ALTOGETHER, **CASES[case]}
@@ -236,7 +236,7 @@ def stops_of(out):
     return dict(zip(state.values["photos"], state.tensors["value.stops"].tolist(), strict=True))
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("views", [1, 3])
 @pytest.mark.parametrize("backbone", ["vanilla", "scaffold"])
 def test_gains_per_photo_identify_the_darker_photos(scene, tmp_path, views, backbone):

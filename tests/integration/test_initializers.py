@@ -26,6 +26,7 @@ def run(scene, out, *options):
     return ended("run", str(scene), *BASE, "--out", str(out), *options)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("backbone", ["vanilla", "scaffold"])
 def test_the_default_initializer_fills_gaps_and_reports_so(scene, tmp_path, backbone):
     options = ("--backbone", backbone, "--densifier", "none")
@@ -36,6 +37,7 @@ def test_the_default_initializer_fills_gaps_and_reports_so(scene, tmp_path, back
     assert not any(note.startswith("start: ") for note in read_notes(tmp_path / "plain"))
 
 
+@pytest.mark.slow
 def test_a_resumed_run_has_the_same_bits(scene, tmp_path):
     options = ("--initializer", "fill-gaps", "--set", "initializer.cells=6")
     assert run(scene, tmp_path / "whole", *options) == 0
@@ -47,6 +49,7 @@ def test_a_resumed_run_has_the_same_bits(scene, tmp_path):
     assert one == other
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("options", [("--init", "random"), ("--recipe", "published")], ids=str)
 def test_options_that_exclude_filling_use_the_points_initializer(scene, tmp_path, options):
     """The written configuration names the points initializer and repeats the run."""
@@ -69,7 +72,7 @@ def sparse(tmp_path_factory):
     return made
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("points", [0, 1, 2])
 @pytest.mark.parametrize("initializer", sorted(entries("initializers")))
 def test_every_initializer_trains_a_scene_with_few_or_no_points(

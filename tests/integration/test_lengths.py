@@ -61,6 +61,7 @@ def trained(**settings):
     return setup, state, seen
 
 
+@pytest.mark.slow
 def test_evaluations_only_at_the_end_change_no_result(scene, tmp_path):
     often = run(scene, tmp_path / "often", steps=9, eval_every=2)
     late = run(scene, tmp_path / "late", steps=9, eval_every=2, eval_from=5)
@@ -69,6 +70,7 @@ def test_evaluations_only_at_the_end_change_no_result(scene, tmp_path):
     assert [row["psnr"] for row in late] == [row["psnr"] for row in often[2:]]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("margin", "told"), [(-100.0, True), (100.0, False)])
 def test_a_run_that_ends_worse_than_an_earlier_step_reports_so(
     scene, tmp_path, monkeypatch, capsys, margin, told
@@ -112,6 +114,7 @@ def test_max_views_ends_a_run_before_its_seconds_are_used(scene, tmp_path):
     assert again == (tmp_path / "run/point_cloud.ply").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_run_in_seconds_notes_reset_options_without_an_effect(scene, tmp_path):
     out, densifier = tmp_path / "run", {"name": "adc", "prune_scale": 0.3}
     run(scene, out, seconds=60.0, max_views=9, densifier=densifier)
@@ -124,6 +127,7 @@ def test_a_run_in_seconds_notes_reset_options_without_an_effect(scene, tmp_path)
     assert app.run(again, verbosity=-1) == 0
 
 
+@pytest.mark.slow
 def test_seconds_end_a_run_before_max_views_is_reached(scene, tmp_path):
     rows = run(scene, tmp_path / "run", seconds=0.5, max_views=10**7)
     assert float(rows[-1]["train_seconds"]) < 5.0
@@ -202,6 +206,7 @@ def test_runs_with_one_and_two_views_per_step_edit_after_the_same_views():
     assert max(one.edits) < 72
 
 
+@pytest.mark.slow
 def test_schedule_unit_steps_counts_events_in_steps():
     setup, _, seen = trained(views=2, steps=72, schedule_unit="steps")
     assert seen.edits == [] and setup.schedule.densify_from == 500

@@ -134,6 +134,7 @@ def test_eval_reports_a_changed_package_version(stopped, install, capsys):
     assert words in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_run_without_a_readable_package_file_is_resumed_with_a_note(stopped, capsys):
     for content in (None, "{", '{"crossgrad": {"versions": []}}', "[1]"):
         (stopped / FILE).unlink()

@@ -212,6 +212,7 @@ def test_an_opened_run_returns_metrics_summary_and_renders(reference, tmp_path, 
         cg.open(tmp_path)
 
 
+@pytest.mark.slow
 def test_an_opened_run_is_read_again_after_it_was_resumed(scene, tmp_path):
     stopped = run(scene, tmp_path / "run", stop_after=5)
     name = stopped.scene.test_views[0].name
@@ -240,7 +241,7 @@ def test_importing_the_core_imports_no_heavy_library():
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "changed",
     [

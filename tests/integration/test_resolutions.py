@@ -88,7 +88,7 @@ CASES = {
 }  # fmt: skip
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_a_resumed_run_ends_with_the_bits_of_an_uninterrupted_run(scene, tmp_path, case):
     assert run(scene, tmp_path / "whole", **CASES[case]) == 0
@@ -99,7 +99,7 @@ def test_a_resumed_run_ends_with_the_bits_of_an_uninterrupted_run(scene, tmp_pat
     assert notes(tmp_path / "whole") == notes(tmp_path / "parts") != []
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("resolution", [OCTAVES, SPECTRAL])
 def test_the_configuration_of_a_run_with_a_time_budget_repeats_it_bit_for_bit(
     scene, tmp_path, monkeypatch, resolution

@@ -110,6 +110,7 @@ def test_a_stopped_run_continues_bit_for_bit(scene, tmp_path, sampler):
     assert rows == quality(tmp_path / "whole")
 
 
+@pytest.mark.slow
 def test_an_averaged_run_resumes_bit_for_bit_and_exports_the_average(scene, tmp_path):
     settings = {"steps": 20, "eval_every": 4}
     tail = {"lr-tail": {"share": 0.5}}
@@ -153,6 +154,7 @@ def test_the_configuration_of_a_run_with_a_time_budget_repeats_it_bit_for_bit(
     assert same(parameters(tmp_path / "timed"), parameters(tmp_path / "again"))
 
 
+@pytest.mark.slow
 def test_notes_that_a_changed_length_makes_wrong_are_withdrawn(
     scene, tmp_path, monkeypatch, capsys
 ):
@@ -176,6 +178,7 @@ def test_notes_that_a_changed_length_makes_wrong_are_withdrawn(
     assert line.startswith("density control is used after all") and line in logged
 
 
+@pytest.mark.slow
 def test_a_stopped_run_resumes_with_the_length_revised_at_its_step(scene, tmp_path):
     lengths = {"steps": 30, "revisions": [[10, 50], [20, 44], [34, 48]]}
     assert run(scene, tmp_path / "whole", **lengths) == 0
@@ -187,6 +190,7 @@ def test_a_stopped_run_resumes_with_the_length_revised_at_its_step(scene, tmp_pa
     assert (tmp_path / "parts" / "config.yaml").read_bytes() == written
 
 
+@pytest.mark.slow
 def test_a_run_that_started_from_a_file_can_be_resumed_without_the_file(scene, tmp_path):
     run(scene, tmp_path / "source", steps=3)
     cloud = tmp_path / "cloud.ply"
@@ -199,6 +203,7 @@ def test_a_run_that_started_from_a_file_can_be_resumed_without_the_file(scene, t
     assert same(parameters(tmp_path / "whole"), parameters(tmp_path / "parts"))
 
 
+@pytest.mark.slow
 def test_separate_gradients_kept_for_an_observer_give_the_same_bits(scene, tmp_path, monkeypatch):
     from crossgrad_core.training.setup import Setup
 
@@ -230,6 +235,7 @@ def in_place(scene, tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1000.0, 0.001])
 def test_the_unit_of_length_of_a_scene_does_not_change_the_result(in_place, tmp_path, scale):
     write_tiny_scene(tmp_path / "scaled", views=9, scale=scale)
@@ -239,6 +245,7 @@ def test_the_unit_of_length_of_a_scene_does_not_change_the_result(in_place, tmp_
     assert a["primitives"] == b["primitives"]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("offset", [(4e5, 5.6e6, 120.0), (1e6, 1e6, 1e6)])
 def test_an_export_far_from_the_origin_has_the_right_position(in_place, tmp_path, offset):
     write_tiny_scene(tmp_path / "utm", views=9, offset=offset)
@@ -248,6 +255,7 @@ def test_an_export_far_from_the_origin_has_the_right_position(in_place, tmp_path
     assert np.abs(np.median(far, 0) - np.median(near, 0) - np.array(offset)).max() < 0.05
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("views", [1, 2, 3])
 def test_any_number_of_views_can_have_photos_of_different_sizes(tmp_path, views):
     write_tiny_scene(tmp_path / "mixed", views=6, mixed=True, folders=("aerial", "street"))
@@ -256,6 +264,7 @@ def test_any_number_of_views_can_have_photos_of_different_sizes(tmp_path, views)
     assert set(summary["regimes"]) == {"aerial", "street"}
 
 
+@pytest.mark.slow
 def test_the_published_recipe_trains_and_gives_different_parameters(scene, tmp_path):
     assert run(scene, tmp_path / "a", recipe={"name": "published"}, steps=60, **GROWTH) == 0
     run(scene, tmp_path / "b", steps=60, **GROWTH)
@@ -333,6 +342,7 @@ def test_one_non_finite_step_is_rewound(scene, tmp_path, monkeypatch):
     assert all(torch.isfinite(t).all() for t in parameters(tmp_path / "run").values())
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("seconds", [0.001, 1.0])
 def test_the_rewind_step_does_not_depend_on_the_clock(scene, tmp_path, monkeypatch, seconds):
     each_step_takes(monkeypatch, seconds)  # Of a second: the run thinks about its length at once.
@@ -341,6 +351,7 @@ def test_the_rewind_step_does_not_depend_on_the_clock(scene, tmp_path, monkeypat
     assert "training returned to step 0" in (tmp_path / "run" / "log.txt").read_text()
 
 
+@pytest.mark.slow
 def test_a_run_with_a_time_budget_and_a_rewind_can_be_repeated(scene, tmp_path, monkeypatch):
     each_step_takes(monkeypatch, 1.0)
     poisoned(monkeypatch, Poison([17]))

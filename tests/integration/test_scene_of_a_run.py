@@ -84,6 +84,7 @@ def spoilt(scene: Path, how: str) -> str:
     return "another local frame: its unit is"
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("change", ["a photo", "held out", "trained", "split", "another scene"])
 def test_a_run_opened_with_another_scene_is_refused_with_the_difference(root, change):
     words = spoilt(root / "scene", change)
@@ -96,6 +97,7 @@ def test_a_run_opened_with_another_scene_is_refused_with_the_difference(root, ch
     assert now == before
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("change", ["trained", "split", "another scene"])
 def test_a_scene_change_that_misplaces_parameters_is_always_refused(root, change):
     words = spoilt(root / "scene", change)

@@ -1,7 +1,8 @@
 """Every combination runs, or is refused with a reason that is written down.
 
-The normal run trains a pairwise design: every two components that can work together meet in some
-case. `make matrix` trains all combinations.
+The normal run trains each component in at least two combinations. `make matrix` trains all
+combinations, and repeats a pairwise design: every two components that can work together meet in
+some case of it.
 """
 
 from collections import Counter
@@ -92,6 +93,7 @@ def with_each_twice(rows):
 
 
 REPEATED = with_each_twice(DESIGN)
+PAIRS_ONLY = [row for row in DESIGN if row not in REPEATED]
 
 
 def require_same_again(row):
@@ -100,17 +102,14 @@ def require_same_again(row):
     require_repeated(run, train(setup(row), STEPS))
 
 
-@pytest.mark.parametrize("row", DESIGN, ids=" x ".join)
+@pytest.mark.parametrize("row", [row for row in DESIGN if row in REPEATED], ids=" x ".join)
 def test_a_combination_trains_and_gives_the_same_bits_when_it_is_repeated(row):
     """Each component is used in at least two repeated runs."""
-    if row in REPEATED:
-        require_same_again(row)
-    else:
-        require_sound(train(setup(row), STEPS))
+    require_same_again(row)
 
 
 @pytest.mark.matrix
-@pytest.mark.parametrize("row", [row for row in DESIGN if row not in REPEATED], ids=" x ".join)
+@pytest.mark.parametrize("row", PAIRS_ONLY, ids=" x ".join)
 def test_every_pair_of_components_trains_repeatably(row):
     require_same_again(row)
 

@@ -50,6 +50,7 @@ def test_points_are_at_the_positions_that_photos_show(town):
     assert np.mean(apart) < 0.7 * np.mean(by_lot)
 
 
+@pytest.mark.slow
 def test_drone_photos_look_down_from_above_and_street_photos_along_the_street(town):
     _, model = town
     for image in model.images.values():

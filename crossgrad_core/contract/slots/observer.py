@@ -10,13 +10,13 @@ class Observer(Component):
 
     An observer must not end a run: it catches its own errors. An observer changes the model through
     hook results only, and returns finite numbers for finite inputs. An observer stores at most 0.1
-    MB per step in memory. On a small scene, each of its calls delays a step by less than 0.1 s. The
-    time of events does not count as training time.
+    MB of memory per step. On a small scene, each call of an observer takes less than 0.1 s. The
+    time of event hooks does not count as training time.
 
     Attributes:
         needs_separate_gradients: True if the observer reads the gradients of single views. The run
-            then stores these gradients separately, which costs memory and changes no bit of the
-            training.
+            then stores these gradients separately, which needs more memory. The training results
+            are the same bit for bit.
     """
 
     slot: ClassVar[str] = "observers"

@@ -86,6 +86,7 @@ def test_baking_an_empty_model_works():
     assert len(as_plain(none, CAMERAS, 0.1, NEAR)) == 0
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("size", [1.0, 0.25, 0.03])
 @pytest.mark.parametrize(
     ("response", "dilation", "blur"), [("antialiased", 0.1, 0.1), ("analytic", 0.0, 1 / 12)]
@@ -111,6 +112,7 @@ def scene(tmp_path_factory):
     return folder
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("backbone", "most"), [("analytic", 0.02), ("mip", 0.02), ("distance", 0)])
 def test_a_trained_scene_loses_little_quality_at_the_camera_it_is_baked_for(
     backbone, most, scene, tmp_path

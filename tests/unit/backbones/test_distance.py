@@ -142,6 +142,7 @@ def regularized(backbone, parameters, step, gaussians=None):
     )
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("step", [1, 15_000, 30_000])
 def test_the_penalty_contains_length_and_squared_derivative_at_the_training_cameras(step):
     backbone = DistanceConditioned(l2_weight=0.3, smoothness_weight=0.7)

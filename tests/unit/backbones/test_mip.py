@@ -53,6 +53,7 @@ def widths_by_loops(means, parity):
     return [sqrt(0.2) * (largest if each is None else each) for each in finest]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("parity", [False, True])
 def test_filter_widths_agree_with_a_loop(parity):
     means = torch.from_numpy(np.random.default_rng(0).uniform(-2, 2, (300, 3)))

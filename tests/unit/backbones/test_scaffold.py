@@ -277,6 +277,7 @@ def test_evenly_chosen_cameras_are_limited_in_number():
     assert evenly(cameras[:5], 32) == cameras[:5]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("options", [{}, {"appearance": 2, "feature_bank": True}])
 def test_training_lowers_the_loss(options):
     config = RunConfig(

@@ -72,7 +72,7 @@ def test_a_method_is_seldom_reported_different_from_itself(scenes, pairs, law):
     assert self_comparisons(scenes=scenes, pairs=pairs, law=law) <= 16
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("pairs", "effects"), [(10, (0.1, -0.1, 0.2, -0.2, 0.0)), (12, (0.1, -0.1, 0.2, -0.2))]
 )
@@ -80,6 +80,7 @@ def test_a_method_is_seldom_reported_different_from_itself_on_different_scenes(p
     assert self_comparisons(scenes=len(effects), pairs=pairs, effects=effects) <= 16
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("scenes", [1, 4])
 def test_one_diverged_run_does_not_make_two_equal_methods_different(scenes):
     assert self_comparisons(scenes=scenes, pairs=12, noise=0.03, diverged=15.0) <= 16
@@ -100,6 +101,7 @@ def test_equal_methods_are_called_equivalent(scenes, law):
     assert share(Verdict.EQUIVALENT, 0.0, scenes=scenes, law=law) >= 0.5
 
 
+@pytest.mark.slow
 def test_a_difference_as_large_as_the_margin_is_seldom_called_equivalent():
     assert share(Verdict.EQUIVALENT, MARGIN, scenes=4) <= 0.1
 

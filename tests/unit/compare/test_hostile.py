@@ -81,6 +81,7 @@ def set_view(value):
     return lambda marks: marks["views"].update({"a/12.jpg": value})
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize(
     ("file", "change"),
     [
@@ -193,6 +194,7 @@ def test_three_seeds_give_the_number_of_pairs_that_would_suffice(tmp_path):
     assert "pairs are needed to detect 0.1 dB" in headlines(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_single_arm_still_gets_a_page(tmp_path, capsys):
     RunFolder().write(tmp_path / "runs" / "only")
     app.compare([tmp_path / "runs"], Options(), None, skip_broken=False)

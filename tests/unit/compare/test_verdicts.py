@@ -126,6 +126,7 @@ def test_the_number_of_needed_pairs_agrees_with_the_table():
     assert pairs_needed(100.0, 0.1) is None
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("spread", [0.01, 0.05, 0.1, 0.2, 0.4])
 @pytest.mark.parametrize("scenes", [1, 4, 6])
 def test_more_pairs_are_needed_exactly_if_the_interval_is_too_wide(spread, scenes):

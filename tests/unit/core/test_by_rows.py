@@ -67,6 +67,7 @@ def test_rows_are_sorted_and_unique(rows):
     assert coalesced(found) is found
 
 
+@pytest.mark.sampled(17)
 @pytest.mark.parametrize("views", [1, 2, 3, 5])
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("granularity", GRANULARITIES)

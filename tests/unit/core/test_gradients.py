@@ -64,6 +64,7 @@ def naive_gramian(views, names):
     return (torch.stack(rows) @ torch.stack(rows).T).numpy()
 
 
+@pytest.mark.sampled(29)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16, torch.float16])
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 8, 16])
 @pytest.mark.parametrize("granularity", ["block", "kind", "global"])
@@ -340,6 +341,7 @@ def test_operators_accept_every_granularity(name, granularity):
         assert bool(torch.isfinite(gradient).all())
 
 
+@pytest.mark.sampled(17)
 @pytest.mark.parametrize("absent", [0, 1, 2])
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 7])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])

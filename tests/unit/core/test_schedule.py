@@ -156,6 +156,7 @@ def test_the_published_schedule_is_the_same_in_views_and_in_steps():
         assert views.progress(step) == steps.progress(step)
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize("views", [600, 2400, 12_000])
 @pytest.mark.parametrize("densifier", ["adc", "mcmc", "multiview", "revising", "anchor", "octree"])
 def test_runs_with_one_and_two_views_per_step_have_events_after_the_same_views(views, densifier):
@@ -176,6 +177,7 @@ def test_runs_with_one_and_two_views_per_step_have_events_after_the_same_views(v
     assert two.coarse_until == one.coarse_until and two.lr_until == one.lr_until
 
 
+@pytest.mark.sampled(29)
 @pytest.mark.parametrize("text", ["1", "2", "3", "1..2@0.5", "4..1@0.2"])
 @pytest.mark.parametrize("steps", [100, 601, 1200, 2500])
 @pytest.mark.parametrize("photos", [1, 24, 112, 3000])
@@ -303,7 +305,7 @@ def test_a_run_whose_length_follows_the_clock_keeps_the_minimum_number_of_edits(
         assert len(done) + len(edits) >= FEWEST_EDITS
 
 
-@pytest.mark.sampled(20)
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize("text", ["1", "2", "1..2@0.5"])
 @pytest.mark.parametrize("seed", range(20))
 def test_repeated_changes_of_length_keep_past_events_and_reschedule_later_ones(text, seed):

@@ -271,6 +271,7 @@ def setup_of(rasterizer, **options):
     return assembling.assemble(config, sample_scene(), "none")
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("rasterizer", ["numba", "torch"])
 def test_a_run_splits_and_requests_directions_only_while_needed(rasterizer):
     options = {"split_scale": 1e-3, "split_threshold": 1e-6, "grad_threshold": 1e-6}

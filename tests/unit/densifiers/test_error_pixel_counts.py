@@ -129,6 +129,7 @@ def brute_counts(ctx, index, threshold=0.1, mask=None):
     return counts, shown > 0, int(doubtful.sum())
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("rasterizer", ["torch", "numba"])
 @pytest.mark.parametrize("backbone", [Vanilla(), Bright()], ids=["one", "two per primitive"])
 @pytest.mark.parametrize("masked", [False, True])

@@ -388,7 +388,7 @@ RUNS = [
 ]
 
 
-@pytest.mark.sampled(5)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("views", "count", "backbone"), RUNS)
 def test_runs_grow_for_any_k_and_every_gaussian_backbone(views, count, backbone):
     _, state, records = run_of(views, backbone, count=count, regimes=views > 1, **EAGER)

@@ -52,7 +52,7 @@ RUNS = [
 ]
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("backbone", "of", "count", "views"), RUNS)
 def test_no_gaussian_grows_with_a_closed_gate_and_many_grow_with_an_open_gate(
     backbone, of, count, views

@@ -47,7 +47,7 @@ BACKBONES = {
 }
 
 
-@pytest.mark.sampled(11)
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", OPTIONS)
 @pytest.mark.parametrize("stop", [3, 4])
 def test_resuming_from_a_checkpoint_changes_no_bit(tmp_path, name, stop, edits_in):

@@ -83,7 +83,7 @@ def observed(densifier, scale):
     return state.states["densifier"].per_primitive
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", NAMES)
 def test_statistics_do_not_depend_on_the_render_scale(name):
     full = observed(name, 1.0)
@@ -99,6 +99,7 @@ def test_statistics_do_not_depend_on_the_render_scale(name):
             assert ratio == pytest.approx(1.0, abs=0.25), (scale, statistic)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("scale", [0.5, 0.25])
 def test_error_shares_refer_to_the_full_photo_at_any_render_scale(scale):
     start = lambda schedule: schedule.first_edit - 1  # noqa: E731

@@ -26,7 +26,7 @@ OPTIONS = {
 pytestmark = pytest.mark.usefixtures("keeps_threads")
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", entries("densifiers"))
 def test_training_gives_the_same_bits_on_any_number_of_threads(name, large_scene, edits_in):
     config = RunConfig(

@@ -186,6 +186,7 @@ def test_the_table_of_a_gradient_probe_has_a_row_per_metric_and_block(model):
     assert whole["sigma_w2"] == pytest.approx(parts)
 
 
+@pytest.mark.slow
 def test_a_repeated_gradient_probe_gives_the_same_table(model):
     def rows():
         measurement = measure(model, plan().views, np.random.default_rng(0))

@@ -71,6 +71,7 @@ def judged(seen, photos=NEAR + FAR):
     return TrackGains(fit.gains, np.bincount(seen.photos, minlength=photos), fit)
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("joining", [16, 40, 200])
 def test_groups_of_different_exposure_are_found_with_few_shared_points(joining, seed):
@@ -79,7 +80,7 @@ def test_groups_of_different_exposure_are_found_with_few_shared_points(joining, 
     assert gains.differ
 
 
-@pytest.mark.sampled(15)
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("joining", [0, 2, 4, 16, 200])
 @pytest.mark.parametrize(

@@ -48,6 +48,7 @@ def turn_of(placed, gaussians):
     return Rotation.align_vectors(after, before)[0].as_matrix()
 
 
+@pytest.mark.sampled(11)
 @pytest.mark.parametrize("degree", [None, 0, 1, 2, 3])
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("coordinates", ["enu", "epsg:4978"])
@@ -149,6 +150,7 @@ def test_a_scene_in_utm_agrees_with_proj_in_metres():
 ZONES = [(51.5, -0.1), (0.0, 0.0), (-1e-9, 6.0), (64.1, -21.9), (-33.9, 151.2), (60.4, 5.3)]
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(("latitude", "longitude"), [*ZONES, (10.0, -180.0), (-75.0, 179.9)])
 def test_the_utm_zone_is_one_in_use_at_its_position(latitude, longitude):
     area = AreaOfInterest(longitude, latitude, longitude, latitude)

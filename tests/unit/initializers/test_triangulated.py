@@ -48,6 +48,7 @@ def test_triangulated_points_are_near_points_of_colmap_and_have_their_colour(sce
     assert f"{len(more.positions)} points triangulated" in FEW.messages(bare)[0]
 
 
+@pytest.mark.slow
 def test_triangulation_is_repeatable(bare):
     ours, again = FEW.more_points(bare), FEW.more_points(replace(bare))
     assert ours.positions.tobytes() == again.positions.tobytes()
@@ -71,7 +72,7 @@ def test_a_scene_without_points_is_refused_with_the_options_that_add_points(bare
     assert setup.selection.initializer == FEW
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("backbone", sorted(entries("backbones")))
 def test_every_backbone_can_start_from_triangulated_points(bare, backbone):
     """Triangulated points have no sizes and opacities, so the backbone must choose them."""

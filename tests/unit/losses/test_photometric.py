@@ -79,6 +79,7 @@ def loss_and_gradient(loss, image, *rest):
     return value.item(), image.grad
 
 
+@pytest.mark.sampled(35)
 @pytest.mark.parametrize("ssim_weight", [0.2, 1.0])
 @pytest.mark.parametrize("mask", MASKS.values(), ids=MASKS)
 @pytest.mark.parametrize(("image", "target", "bound"), CASES.values(), ids=CASES)
@@ -235,6 +236,7 @@ def test_invalid_shapes_are_refused(image, target, mask):
         photometric_loss(image, target, mask)
 
 
+@pytest.mark.sampled(11)
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("name", CASES)
 def test_the_analytic_gradient_agrees_with_autograd(name, masked):

@@ -56,6 +56,7 @@ def far_apart(rng):
 FAMILIES = (short_rows, of_low_rank, nearly_alike, far_apart)
 
 
+@pytest.mark.sampled(11)
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.__name__)
 @pytest.mark.parametrize("name", OURS)
 def test_random_degenerate_gramians_give_finite_weights(name, family, ask):
@@ -76,6 +77,7 @@ def test_nash_does_not_stop_between_damped_and_full_steps():
         assert judged("nash", of_low_rank(rng)[:7], torch.float32) <= 8
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", ["nash", "aligned"])
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 @pytest.mark.parametrize("dtype", TYPES)
@@ -88,6 +90,7 @@ def test_nearly_parallel_pairs_are_exact_at_every_distance(name, sign, dtype):
         assert judged(name, rows, dtype) <= 8
 
 
+@pytest.mark.sampled(13)
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.__name__)
 @pytest.mark.parametrize("name", ["nash", "imtl-g", "aligned", "gradvac", "soft"])
 @pytest.mark.parametrize("dtype", TYPES)

@@ -22,6 +22,7 @@ def same(one, other, rows):
     np.testing.assert_allclose(one.weights * norms, other * norms, rtol=1e-12, atol=1e-12 * size)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("name", "factor"),
     [("pcgrad", 1), ("upgrad", 2), ("gradvac", 1), ("anchors", 1), ("soft", 1)],

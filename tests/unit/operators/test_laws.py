@@ -40,7 +40,7 @@ def test_every_operator_obeys_every_law(name, law):
     assert error is None or error <= 8
 
 
-@pytest.mark.sampled(6)
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", GRAMIAN)
 @DRAWN
 @given(data=st.data())
@@ -61,6 +61,7 @@ def test_results_for_any_gradients_are_finite_and_independent_of_scale(
         np.testing.assert_array_equal(weights, results[1])
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", UNORDERED)
 @DRAWN
 @given(data=st.data())

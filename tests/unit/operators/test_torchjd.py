@@ -69,6 +69,7 @@ def test_gradvac_follows_the_target_cosines_of_torchjd(beta, ask):
         np.testing.assert_allclose(found.weights, expected, rtol=TOLERANCE, atol=TOLERANCE)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("views", VIEWS)
 def test_mgda_is_at_least_as_good_as_torchjd(views, ask):
     """The Frank-Wolfe steps of TorchJD shrink slowly, so its result is longer.
@@ -85,7 +86,7 @@ def test_mgda_is_at_least_as_good_as_torchjd(views, ask):
         assert ((found - expected) ** 2).sum() <= excess + 1e-12 * (expected @ expected)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("views", VIEWS)
 def test_mgda_agrees_with_torchjd_if_every_view_has_a_positive_weight(views, ask):
     """The Frank-Wolfe method converges fast if the shortest point is far inside the convex hull."""
@@ -108,6 +109,7 @@ def test_cone_projections_agree_with_torchjd(name, weighting, views, ask):
     agree(name, getattr(aggregation, f"{weighting}Weighting")(projector=projector), views, ask)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("views", VIEWS)
 @pytest.mark.filterwarnings("ignore:Solution may be inaccurate")
 def test_cagrad_agrees_with_torchjd_with_a_tight_solver(views, ask, monkeypatch):
@@ -117,6 +119,7 @@ def test_cagrad_agrees_with_torchjd_with_a_tight_solver(views, ask, monkeypatch)
     agree("cagrad", aggregation.CAGradWeighting(c=0.5, norm_eps=1e-12), views, ask)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("views", VIEWS)
 def test_cagrad_is_never_worse_than_torchjd_with_default_solver(views, ask):
     """The default solver of TorchJD is accurate to about 6e-5.

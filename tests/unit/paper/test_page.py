@@ -150,6 +150,7 @@ def test_machines_are_listed_with_their_commits(modules, planted, grid_of):
     assert "Machines: A Processor, crossgrad 0.2.0 (commits: aaaaaaa, bbbbbbb). " in text
 
 
+@pytest.mark.slow
 def test_the_same_results_give_the_same_page(modules, planted, grid_of):
     sweep = planted("again", {"symmetric": 0.0, "near-far": 0.0})
     pages = []

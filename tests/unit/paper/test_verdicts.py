@@ -91,6 +91,7 @@ def test_many_failed_runs_leave_a_claim_undecided(modules, planted, grid_of, fai
     assert f"{failed} of 12 pairs failed" in found.detail
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("level", "elsewhere", "says"), [(0.3, -0.3, "better"), (-0.3, 0.3, "worse"), (0, 0.5, "equal")]
 )
@@ -184,6 +185,7 @@ def test_blocks_are_compared_and_averaged_run_by_run(modules, planted, grid_of):
     assert found[0].figure.startswith("+0.800") and found[2].figure.startswith("0.400")
 
 
+@pytest.mark.slow
 def test_the_tables_of_the_paper_contradict_its_text_about_the_closed_gap(modules):
     """The text states 80 to 100 % on four of five scenes.
 

@@ -484,6 +484,7 @@ def test_a_run_without_a_length_gets_a_length_from_its_photos(photos):
     assert (decided.max_views, decided.steps, decided.seconds) == (most, None, None)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("photos", "stays"), [(299, False), (300, True), (2_000, True)])
 def test_the_planned_length_is_never_longer_than_the_default(photos, stays):
     found = length_of(photos)
@@ -492,6 +493,7 @@ def test_the_planned_length_is_never_longer_than_the_default(photos, stays):
     assert bool(found.settings) != stays
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("views", "photos"), [(2, 600), ("1..2@0.5", 450), ("2..1@0.9", 570)])
 def test_the_planned_length_counts_every_view_of_a_step(views, photos):
     assert length_of(photos - 1, views_per_step=views).choice == f"{100 * photos - 100:,} views"

@@ -85,6 +85,7 @@ def walk(rng, orientation, pitch, count=12):
     return model
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize("orientation", [1, 6])
 @pytest.mark.parametrize("pitch", [-50.0, 0.0, 15.0])
 @pytest.mark.parametrize("seed", range(3))

@@ -213,6 +213,7 @@ def test_hidden_files_of_other_programs_are_kept_and_temporary_files_of_prepare_
     (scene / "prepare" / "models" / ".DS_Store").unlink()
 
 
+@pytest.mark.slow
 def test_repeating_the_last_stages_gives_the_same_scene(report, photos, scene):
     """Work that a killed process did not finish is repeated with the same result."""
     before = content(scene)

@@ -254,7 +254,7 @@ def name(request):
     return request.param
 
 
-@pytest.mark.sampled(60)
+@pytest.mark.sampled(23)
 @pytest.mark.parametrize("case_name", CASES)
 def test_each_rasterizer_agrees_with_the_reference(name, case_name):
     made, exact = settled(CASES[case_name]())
@@ -345,6 +345,7 @@ def test_marked_pixels_of_random_views_are_counted_exactly(seed, response, size,
         assert torch.equal(render.screen.count(marked), expected), name
 
 
+@pytest.mark.sampled(37)
 @pytest.mark.parametrize(
     ("tensor", "value"),
     [

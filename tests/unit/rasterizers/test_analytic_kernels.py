@@ -44,6 +44,7 @@ def test_the_window_is_the_difference_of_the_distribution_function_across_a_pixe
     assert central_window(sigma) == pytest.approx(window(0.0, sigma), rel=1e-12)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("opacity", [0.004, 0.02, 0.3, 1.0])
 def test_pixels_touched_by_a_gaussian_are_within_its_radius(opacity):
     rng = np.random.default_rng(0)

@@ -37,6 +37,7 @@ def drawn(gaussians, camera, weights, background=(0.0, 0.0, 0.0), name="torch", 
     return render.screen
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("response", ["plain", "antialiased", "analytic"])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_direction_bins_of_the_reference_agree_with_gradients_of_single_pixels(response, seed):
@@ -51,8 +52,15 @@ def test_direction_bins_of_the_reference_agree_with_gradients_of_single_pixels(r
     assert found[..., :2] == pytest.approx(expected[..., :2], abs=1e-4)
 
 
-@pytest.mark.parametrize("name", ["torch", "numba"])
-@pytest.mark.parametrize("response", ["plain", "antialiased", "analytic"])
+@pytest.mark.parametrize(
+    ("name", "response"),
+    [
+        *[("torch", response) for response in ("plain", "antialiased", "analytic")],
+        *[("numba", response) for response in ("plain", "antialiased")],
+        # Its kernels take ten seconds to compile, and no other test uses them.
+        pytest.param("numba", "analytic", marks=pytest.mark.slow),
+    ],
+)
 def test_direction_bins_add_up_to_the_statistics_without_bins(name, response):
     gaussians = random_gaussians(80, CAMERA, response=response)
     screen = drawn(gaussians, CAMERA, weighting(CAMERA), name=name)

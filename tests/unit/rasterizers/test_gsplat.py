@@ -136,6 +136,7 @@ def test_gsplat_differs_from_the_default_only_by_its_alpha_cap_of_0_999(gsplat):
     assert 0.0 < (theirs - ours).max() <= 0.0091
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 @pytest.mark.parametrize("band", [1 << 19, 3 * 37])
 def test_gsplat_pixel_counts_agree_with_the_reference(gsplat, monkeypatch, camera, band):
@@ -204,6 +205,7 @@ def test_an_empty_model_gives_the_background(gsplat):
     assert first.screen.mean_gradient.shape == first.screen.abs_gradient.shape == (0, 2)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("taken_back", [False, True])
 def test_a_deleted_render_frees_its_memory(gsplat, monkeypatch, taken_back):
     centers = []

@@ -24,6 +24,7 @@ def drawn(gaussians):
     return NumbaRasterizer().render(gaussians, sample_camera(), torch.zeros(3))
 
 
+@pytest.mark.sampled(37)
 @pytest.mark.parametrize("harmonics", [False, True])
 @pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.parametrize(

@@ -81,6 +81,7 @@ def by_pixel(of):
     return image, radii
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("seed", range(3))
 def test_every_pixel_follows_the_published_rule(name, seed):

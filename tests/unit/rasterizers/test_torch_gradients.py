@@ -138,6 +138,7 @@ def test_absolute_gradients_are_computed_only_if_requested():
     assert result.screen.abs_gradient is None
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("response", RESPONSES)
 def test_rendering_tiles_again_for_the_backward_pass_changes_no_bit(response, monkeypatch):
     camera = posed_camera(37, 21)

@@ -190,6 +190,7 @@ def test_the_analytic_response_ignores_dilation():
     assert torch.equal(render(gaussians, posed_camera()).image, render(wide, posed_camera()).image)
 
 
+@pytest.mark.sampled(13)
 @pytest.mark.parametrize(
     ("field", "value"),
     [

@@ -179,6 +179,7 @@ def parameters_after(path, reader):
     return {name: tensor.detach() for name, tensor in state.parameters.items()}
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("reader", EXACT)
 def test_formats_with_matrices_train_to_the_same_bits(reader, trained):
     ours, theirs = trained(reader), trained("colmap")
@@ -186,7 +187,7 @@ def test_formats_with_matrices_train_to_the_same_bits(reader, trained):
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("reader", ROUNDED)
 def test_formats_with_rounded_cameras_train_nearly_alike(reader, trained):
     ours, theirs = trained(reader), trained("colmap")

@@ -73,6 +73,7 @@ def _below(path, name):
     return folder + name
 
 
+@pytest.mark.sampled(11)
 @pytest.mark.parametrize("reader", FILES)
 @pytest.mark.parametrize("form", FORMS)
 def test_photos_are_found_by_the_end_of_their_path(reader, form, make):

@@ -45,6 +45,7 @@ def test_a_finished_run_records_every_decided_value(finished):
     assert rows["rate_factor"]["value"] == 6.3 and rows["rate_factor"]["override"]
 
 
+@pytest.mark.slow
 def test_a_run_is_repeated_bit_for_bit_after_the_constants_of_the_recipe_changed(
     finished, tmp_path, monkeypatch
 ):
@@ -89,6 +90,7 @@ def test_a_value_that_rounds_to_the_published_value_is_not_reported():
     assert not [line for line in short_lines(setup.decisions) if line.startswith("beta1 ")]
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize("name", DECIDED)
 def test_a_recipe_without_a_row_is_refused_with_the_name_of_the_setting(name, monkeypatch):
     decide = Auto.decide
@@ -109,6 +111,7 @@ def test_a_reason_for_something_that_is_not_a_setting_is_refused(name):
     assert f"{name} is not a setting" in str(caught.value)
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize("steps", [30, 700, 3_000, 15_000, 60_000])
 @pytest.mark.parametrize("backbone", ["vanilla", "scaffold", "mip"])
 def test_the_terminal_shows_a_few_short_lines(steps, backbone):

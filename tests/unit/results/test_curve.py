@@ -36,6 +36,7 @@ def _figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
     return saved
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("count", [1, 2, 100])
 def test_the_curve_shows_psnr_and_ssim_overall_and_per_regime(tmp_path: Path, figures, count: int):
     path = draw_curve(tmp_path, make_rows(count), "title", {"overall": 3, "near": 1, "far": 2})

@@ -46,6 +46,7 @@ def with_photos(count):
     return replace(scene, train=tuple(scene.train[0] for _ in range(count)))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("share", [0.1, 0.3, 0.9])
 def test_dropout_removes_a_share_of_gaussians_and_increases_the_other_opacities(share):
     setup = setup_of(rules={"dropout": {"share": share}})
@@ -124,6 +125,7 @@ def test_the_documented_dropout_default_is_correct():
     assert f"{DROPOUT}" in row and f"{FEW_PHOTOS} training photos" in row
 
 
+@pytest.mark.slow
 def test_a_resumed_run_has_the_same_bits():
     setup = setup_of(rules={"dropout": {"share": 0.3}})
     whole = first_state(setup)

@@ -93,7 +93,7 @@ def expected(setup, state):
     return found
 
 
-@pytest.mark.sampled(7)
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("backbone", BACKBONES)
 @pytest.mark.parametrize("seed", range(3))
 def test_floaters_are_the_primitives_near_a_camera_that_no_training_photo_shows(backbone, seed):
@@ -108,6 +108,7 @@ def test_floaters_are_the_primitives_near_a_camera_that_no_training_photo_shows(
     assert 0 < len(want) < near.sum() < len(near)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("backbone", BACKBONES)
 def test_removing_floaters_does_not_change_the_renders_of_photos(backbone):
     setup = setup_of(backbone)

@@ -195,6 +195,7 @@ def removing(rows):
     return Edit(source=torch.arange(rows))
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize(
     ("hook", "answer"),
     [

@@ -114,7 +114,7 @@ def runs(request):
     return SimpleNamespace(setups=setups, again=trained(setups["both"], state=again)[0], **found)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 def test_learning_rates_equal_the_published_rates_until_they_decay(runs):
     blocks = runs.setups["plain"].trained_blocks
     of = {name: block.lr for block in blocks for name in block.tensors}
@@ -130,6 +130,7 @@ def test_learning_rates_equal_the_published_rates_until_they_decay(runs):
     assert constant and all(published[0][n] == published[-1][n] for n in constant)
 
 
+@pytest.mark.sampled(3)
 def test_the_average_of_parameters_covers_the_last_steps_and_does_not_change_training(runs):
     (plain, _, _), (state, seen, _) = runs.plain, runs.averaged
     assert same(plain.parameters, state.parameters)
@@ -248,6 +249,7 @@ def test_a_longer_length_discards_an_average_that_began_too_early():
     assert run.rule.crossgrad_eval_parameters({NAME: run.held}) is None
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("edit", "count"),
     [

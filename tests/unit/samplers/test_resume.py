@@ -32,6 +32,7 @@ def start(name):
     return SamplerRun(build("samplers", name, options), scene, groups, k, losses=losses)
 
 
+@pytest.mark.sampled(10)
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("stop", [1, 7, 20])
 def test_a_resumed_sampler_continues_with_the_same_views(name, stop):

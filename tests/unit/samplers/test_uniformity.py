@@ -41,6 +41,7 @@ CASES = {
 }
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("case", CASES)
 def test_views_are_drawn_with_the_promised_probability(case):
     sampler, groups, k, expected = CASES[case]
@@ -49,6 +50,7 @@ def test_views_are_drawn_with_the_promised_probability(case):
     assert chisquare(counts, expected * counts.sum()).pvalue > 1e-3
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     "case", ["random", "random distinct", "near-far", "near-far four", "three-way"]
 )
@@ -122,6 +124,7 @@ def test_the_horizon_sampler_keeps_its_ratios_exactly(k):
     assert coarse[:6] == ["far", "far", "near"] * 2
 
 
+@pytest.mark.sampled(11)
 @pytest.mark.parametrize("percent", range(1, 100))
 def test_the_horizon_sampler_completes_its_first_stage(percent):
     # All of it far, then all near: 0.29 of 100 steps are 29, though not in binary numbers.
@@ -138,6 +141,7 @@ def test_the_horizon_sampler_uses_every_view_of_a_group_before_any_is_repeated()
     assert all(sorted(far[i : i + 6]) == [3, 4, 5, 6, 7, 8] for i in range(0, 24, 6))
 
 
+@pytest.mark.slow
 def test_random_halves_are_drawn_once_and_do_not_depend_on_the_groups():
     halves = set()
     for seed in range(200):

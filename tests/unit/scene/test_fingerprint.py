@@ -109,6 +109,7 @@ def test_changed_new_and_missing_masks_are_reported(scene, change):
     assert told(scene, was) == [(Weight.CONTENT, text)]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("other", "text"),
     [

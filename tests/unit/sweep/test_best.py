@@ -176,6 +176,7 @@ PLAIN = (
 )
 
 
+@pytest.mark.sampled(23)
 @pytest.mark.parametrize("arms", CHOICES.split("---"))
 @pytest.mark.parametrize("base", ["{backbone: mip}", "{operator: {name: cagrad, c: 0.7}}"])
 @pytest.mark.parametrize("fixed", PLAIN)

@@ -92,6 +92,7 @@ def test_a_plugin_that_calls_exit_on_creation_fails_the_first_check(installed):
     assert found == {"it can be created with default options": "SystemExit: 0"}
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("kind", ["Misspelt", "Ends"])
 def test_a_broken_backbone_of_another_package_does_not_fail_a_densifier(installed, kind):
     installed(BACKBONE, backbones={"aaa": f"made_up_check:{kind}"})

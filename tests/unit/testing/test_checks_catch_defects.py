@@ -1032,12 +1032,14 @@ def name_of(value):
     return getattr(value, "__name__", None)
 
 
+@pytest.mark.sampled(53)
 @pytest.mark.parametrize(("check", "make"), DEFECTS, ids=name_of)
 def test_each_defect_fails_its_check(check, make):
     with pytest.raises(ContractError, match=r"\w+ \w+"):
         check(make)
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize(("check", "make", "error"), RAISING, ids=name_of)
 def test_an_error_of_the_component_is_passed_on(check, make, error):
     with pytest.raises(error):

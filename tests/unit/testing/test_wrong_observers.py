@@ -11,6 +11,8 @@ from crossgrad_core import plugin as api
 from crossgrad_core.testing import observers
 from crossgrad_core.testing.support.contract import ContractError
 
+pytestmark = pytest.mark.usefixtures("few_objects")
+
 
 class RaisesLate(api.Observer):
     @api.hookimpl

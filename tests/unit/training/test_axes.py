@@ -212,6 +212,7 @@ def test_short_runs_use_position_steps_along_the_axes_of_gaussians(settings, by_
     assert (axes_of(setup_of(**settings)) is not None) == by_size
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("backbone", BACKBONES)
 def test_a_step_moves_positions_along_the_axes_of_their_gaussians(backbone):
     moved = {}

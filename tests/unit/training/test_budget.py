@@ -137,6 +137,7 @@ def test_speed_probe_steps_use_all_sh_bands_and_levels_without_edits(mode):
     assert schedule.coarse_until == 0 == schedule.densify_from
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("views", ["1", "3", "1..2@0.5"])
 @pytest.mark.parametrize("name", ["full", "octaves", "strided"])
 def test_speed_probe_steps_collect_statistics_and_use_all_sh_bands(monkeypatch, name, views):

@@ -98,7 +98,7 @@ def trained(setup, state, sink, pauses=()):
     return ended
 
 
-@pytest.mark.sampled(7)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("step", [3, 7, 12, STEPS])
 @pytest.mark.parametrize(
     ("kept", "settings"),

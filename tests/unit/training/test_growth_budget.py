@@ -79,7 +79,7 @@ def test_the_growth_curve_is_the_published_curve(start, budget, events, share):
     assert curve(events, events, start, budget) == budget
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", GREEDY)
 def test_every_growing_densifier_follows_the_budget_curve(name):
     free = counts_of(setup_of(name))
@@ -139,6 +139,7 @@ def test_pruned_gaussians_free_room_for_growth():
     assert timed_step(setup, state).primitives == 20  # All are cloned: far from the curve.
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize(
     ("settings", "growth", "bound"),
     [
@@ -173,7 +174,7 @@ def test_growth_and_budget_follow_the_settings(settings, growth, bound):
     assert ("growth" in shown) == (growth == "budget" and "growth" not in settings)
 
 
-@pytest.mark.sampled(5)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("growth", ["unbounded", "budget"])
 @pytest.mark.parametrize("name", GREEDY)
 def test_a_max_gaussians_below_the_number_of_points_leaves_room_for_growth(name, growth):

@@ -150,6 +150,7 @@ def test_ten_thousand_deferred_steps_have_the_bits_of_immediate_steps(long_wait)
     assert long_wait[0].same()
 
 
+@pytest.mark.slow
 def test_ten_thousand_deferred_steps_are_accurate_to_rounding(long_wait):
     both, start, oracle = long_wait
     way, error = np.abs(oracle - start).max(), np.abs(both.rows.double().numpy() - oracle)
@@ -303,7 +304,7 @@ def everything(state):
 THIRD = {"rules": {"sparse-sh": {"every": 3}}}
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("settings", "plugins"),
     [
@@ -336,7 +337,7 @@ def test_runs_with_deferred_steps_have_the_bits_of_runs_without(monkeypatch, set
         assert all(torch.equal(ours[name], theirs[name]) for name in ours)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("settings", "stop"),
     [

@@ -19,6 +19,8 @@ from crossgrad_core.training import growth_budget, memory, step
 from crossgrad_core.training.memory import Demand, available_bytes, peak_mebibytes
 from crossgrad_core.training.start import first_state
 
+pytestmark = pytest.mark.usefixtures("few_objects")
+
 CPU = torch.device("cpu")
 GIB = 2**30
 

@@ -212,6 +212,7 @@ class NumbaTogether(NumbaRasterizer):
     batched: ClassVar[bool] = True
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     "options",
     [

@@ -175,7 +175,7 @@ def assert_same(state, wanted) -> None:
             assert torch.equal(tensor, theirs[key]), (name, key)
 
 
-@pytest.mark.sampled(6)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("hook", "method", "kept"), HOOKS)
 def test_a_plugin_that_raises_leaves_a_valid_state(hook, method, kept):
     setup = assembled(trap(hook, method, BrokenError("sorry")))

@@ -37,7 +37,7 @@ def setup_of(sampler, **changes):
     return replace(assemble(config, sample_scene(), "none"), photos_ahead=Told())
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("sampler", SAMPLERS)
 def test_the_sampled_views_are_predicted_from_the_first_step_on(sampler):
     setup = setup_of(sampler)
@@ -51,7 +51,7 @@ def test_the_sampled_views_are_predicted_from_the_first_step_on(sampler):
     assert len(setup.photos_ahead.names) == 12
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("sampler", [*SAMPLERS, "active"])
 def test_prediction_changes_nothing_in_the_run(sampler):
     setup = setup_of(sampler)

@@ -60,6 +60,7 @@ def of_slot(slot, name, method, answer):
     return type("Wrong", (kind,), {method: wrong, "__module__": __name__})()
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize("answer", [None, NO_EDIT, (NO_EDIT,), (None, PluginState())])
 @pytest.mark.parametrize(
     ("word", "slot", "name", "method"),
@@ -260,6 +261,7 @@ def test_the_reserved_names_are_the_state_names_of_the_core():
     assert slots | own | {start.THINNED} == TAKEN
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize(
     ("edit", "found"),
     [
