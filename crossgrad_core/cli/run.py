@@ -21,7 +21,17 @@ if TYPE_CHECKING:
 
 #: Options that apply only to this start of the command.
 _OF_THE_COMMAND: Final = frozenset(
-    {"resume", "accept_scene", "accept_plugins", "check", "quiet", "verbose", "view", "host", "port"}
+    {
+        "resume",
+        "accept_scene",
+        "accept_plugins",
+        "check",
+        "quiet",
+        "verbose",
+        "view",
+        "host",
+        "port",
+    }
 )
 
 

@@ -24,19 +24,13 @@ from crossgrad_core.plugin import (
     Scene,
     Similarity,
     UserError,
-    View,
     build_component,
-    centers_of,
 )
-from crossgrad_plugins.view.cameras import first_camera, moved
+from crossgrad_plugins.view.cameras import free_camera, moved
 from crossgrad_plugins.view.server import Viewer
 from crossgrad_plugins.view.session import Stage
 from crossgrad_plugins.view.sources import Source, frame_of
 
-#: The page draws at most this many cameras and points.
-_MOST_CAMERAS, _MOST_POINTS = 1_000, 200_000
-#: Length of a drawn camera, as a share of the distance to the next camera and of the scene.
-_OF_NEXT, _OF_SCENE = 0.4, 0.03
 _CONFIG: Final = "config.yaml"
 
 
@@ -65,37 +59,9 @@ def stage_of(paths: Sequence[Path], how: How) -> Stage:
     sources = [source for source, _ in opened]
     scene = next((scene for _, scene in opened if scene is not None), None)
     world = sources[0].similarity if scene is None else scene.similarity
-    shows_points = all(source.draw is None for source in sources)
     runs = [path for path in paths if (path / _CONFIG).is_file()]
     command = f"crossgrad render {runs[0]}" if runs else None
-    return stage_for(sources, world, scene, command, points=shows_points)
-
-
-def stage_for(
-    sources: list[Source],
-    world: Similarity,
-    scene: Scene | None,
-    command: str | None,
-    *,
-    points: bool = False,
-) -> Stage:
-    """Return the stage of opened sources; see `Stage`."""
-    views = [] if scene is None else list(scene.views)
-    views = views[:: -(-len(views) // _MOST_CAMERAS) or 1]
-    cloud = None
-    if points and scene is not None:
-        kept = slice(None, None, -(-len(scene.points) // _MOST_POINTS) or 1)
-        cloud = scene.points[kept], scene.point_colors[kept]
-    return Stage(
-        sources=lambda: sources,
-        world=world,
-        views=views,
-        first=first_camera(views, np.zeros((0, 3))),
-        spacing=_spacing(views),
-        points=cloud,
-        folder=Path.cwd(),
-        command=command,
-    )
+    return Stage(lambda: sources, world, scene, command)
 
 
 def _opened(path: Path, how: How) -> tuple[Source, Scene | None]:
@@ -136,21 +102,9 @@ def _of_file(path: Path, how: How) -> Source:
     return Source.of_gaussians(title, gaussians, similarity, rasterizer)
 
 
-def _spacing(views: list[View]) -> float:
-    """Return the length of a drawn camera in local units."""
-    from scipy.spatial import cKDTree
-
-    centers = centers_of(views)
-    if len(centers) < 2:  # noqa: PLR2004 - a camera has no next camera
-        return _OF_SCENE
-    next_ones = cKDTree(centers).query(centers, k=2)[0][:, 1]
-    extent = float(np.linalg.norm(np.ptp(centers, axis=0)))
-    return max(min(_OF_NEXT * float(np.median(next_ones)), _OF_SCENE * extent), 1e-4)
-
-
 def warm_up(stage: Stage) -> None:
     """Draw a small frame with every output, so that kernels are compiled before a window opens."""
-    camera = stage.first.resized(64, 36)
+    camera = free_camera().resized(64, 36)
     with torch.no_grad():
         for source in stage.sources():
             for outputs in (frozenset(), frozenset({"depth"})):

@@ -1,14 +1,15 @@
 """Cameras of a browser window: poses, the fit of a photo into the window, the first view."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import atan, isfinite, tan
+from math import atan, tan
 from typing import Final, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from crossgrad_core.plugin import Camera, Similarity, View
+from crossgrad_core.plugin import Camera, Similarity, View, centers_of
 
 _Floats = NDArray[np.float64]
 #: Maximum number of pixels of a frame. A larger window shows an enlarged frame.
@@ -18,6 +19,10 @@ _SIDES: Final = (16, 16_384)
 #: Two poses are equal up to the rounding of the browser: difference of the rotation's entries, and
 #: distance in local units.
 _SAME_ROTATION, _SAME_PLACE = 1e-3, 1e-3
+#: Smallest share of the second direction in the horizontal axes of cameras that span a plane.
+_SPAN: Final = 0.05
+#: Length of a drawn camera, as a share of the distance to the next camera and of the scene.
+_OF_NEXT, _OF_SCENE = 0.4, 0.03
 
 
 class Window(Protocol):
@@ -134,20 +139,49 @@ def fov_in_window(window: Camera, photo: Camera) -> float:
     return 2 * atan(fit.height / 2 / fit.camera.fy)
 
 
-def first_camera(views: list[View], points: _Floats) -> Camera:
-    """Return the camera at which a page opens: the first view, else a look at the points."""
-    if views:
-        return views[0].camera
-    middle = np.median(points, axis=0) if len(points) else np.zeros(3)
+def free_camera() -> Camera:
+    """Return a camera in front of the unit cube around the origin, with z upward."""
     pose = np.eye(4)
     pose[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
-    pose[:3, 3] = -pose[:3, :3] @ middle + np.array([0.0, 0.0, 3.0])
+    pose[2, 3] = 3.0
     return Camera(1280, 720, 900.0, 900.0, 640.0, 360.0, torch.from_numpy(pose))
 
 
-def up_of(views: list[View]) -> _Floats:
-    """Return the mean upward direction of the cameras, a unit vector; z without cameras."""
-    rows = [-view.camera.world_to_camera[1, :3].numpy() for view in views]
-    up = np.mean(rows, axis=0) if rows else np.array([0.0, 0.0, 1.0])
-    length = float(np.linalg.norm(up))
-    return np.asarray(up / length) if isfinite(length) and length > 0 else np.array([0.0, 0.0, 1.0])
+def up_of(views: Sequence[View]) -> _Floats:
+    """Return the upward direction of a scene, a unit vector; z without cameras.
+
+    Cameras are rarely rolled, so that their horizontal axes span the ground plane. If all cameras
+    look the same way, the mean of their upward axes is used.
+    """
+    if not views:
+        return np.array([0.0, 0.0, 1.0])
+    across, down, ahead = np.stack([v.camera.world_to_camera[:3, :3].numpy() for v in views], 1)
+    values, vectors = np.linalg.eigh(across.T @ across / len(views))
+    if values[1] < _SPAN:
+        return _unit(-down.mean(axis=0), np.array([0.0, 0.0, 1.0]))
+    # A camera looks level, or down on the scene.
+    return np.asarray(vectors[:, 0] * (1.0 if vectors[:, 0] @ -(down + ahead).sum(0) > 0 else -1.0))
+
+
+def _unit(vector: _Floats, otherwise: _Floats) -> _Floats:
+    length = float(np.linalg.norm(vector))
+    return np.asarray(vector / length) if length > 0 else otherwise
+
+
+def distance_ahead(view: View, points: _Floats, otherwise: float) -> float:
+    """Return the distance from a view to what it shows: the median depth of its SfM points."""
+    depths = view.camera.local(points[view.seen])[:, 2]
+    depths = depths[depths > 0]
+    return float(np.median(depths)) if len(depths) else otherwise
+
+
+def spacing_of(views: Sequence[View]) -> float:
+    """Return the length at which the cameras are drawn, in local units."""
+    from scipy.spatial import cKDTree
+
+    centers = centers_of(views)
+    if len(centers) < 2:  # noqa: PLR2004 - a camera has no next camera
+        return _OF_SCENE
+    next_ones = cKDTree(centers).query(centers, k=2)[0][:, 1]
+    extent = float(np.linalg.norm(np.ptp(centers, axis=0)))
+    return max(min(_OF_NEXT * float(np.median(next_ones)), _OF_SCENE * extent), 1e-4)

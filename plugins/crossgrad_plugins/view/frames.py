@@ -92,7 +92,7 @@ class Frame:
         fit, look = self.fit, self.look
         columns = round(min(max(look.split, 0.0), 1.0) * fit.width) - fit.left
         width = fit.camera.width
-        columns = 0 if columns < 0 else width if columns > width else columns
+        columns = 0 if columns < 0 else min(columns, width)
         frame = np.zeros((fit.height, fit.width, 3), dtype=np.uint8)
         image = frame[fit.top :, fit.left :][: fit.camera.height, :width]
         if columns > 0:

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from time import perf_counter
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from pydantic import Field, PrivateAttr
 from typing_extensions import override
@@ -84,7 +84,7 @@ class LiveViewer(Observer):
         sys.stderr.flush()
 
     def _stage(self, run: RunInfo) -> "Stage":
-        from crossgrad_plugins.view.app import stage_for
+        from crossgrad_plugins.view.session import Stage
         from crossgrad_plugins.view.sources import Source
         from crossgrad_plugins.view.training import Training
 
@@ -93,11 +93,7 @@ class LiveViewer(Observer):
         title = f"{scene.name} in training" if run.folder is None else f"{run.folder} in training"
         self._source = replace(Source.of_scene(title, scene), draw=_no_model)
         command = None if run.folder is None else f"crossgrad render {run.folder}"
-        return replace(
-            stage_for([], scene.similarity, scene, command),
-            sources=lambda: [self._source],
-            training=self._training,
-        )
+        return Stage(lambda: [self._source], scene.similarity, scene, command, self._training)
 
     @hookimpl
     def crossgrad_step_end(self, record: StepRecord) -> None:

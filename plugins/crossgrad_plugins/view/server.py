@@ -107,7 +107,7 @@ class Viewer:
     @property
     def url(self) -> str:
         """The address of the page."""
-        anywhere = self._host in {"0.0.0.0", "::", ""}  # noqa: S104 - the user's own choice
+        anywhere = self._host in {"0.0.0.0", "::", ""}
         host = "localhost" if anywhere else f"[{self._host}]" if ":" in self._host else self._host
         return f"http://{host}:{self._server.get_port()}"
 

@@ -3,28 +3,33 @@
 import io
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from time import monotonic
 from typing import Any, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from crossgrad_core.plugin import Camera, Similarity, UserError, View
+from crossgrad_core.plugin import Camera, Scene, Similarity, UserError, View
 from crossgrad_plugins.view.camera_file import write_camera_path
 from crossgrad_plugins.view.cameras import (
     camera_of,
+    distance_ahead,
     fov_in_window,
     fov_of,
+    free_camera,
     looks_like,
     photo_in_window,
     quaternion_of,
+    spacing_of,
     whole_window,
 )
-from crossgrad_plugins.view.frames import Frame, Layer, Look, Pixels, layers_of
+from crossgrad_plugins.view.frames import Frame, Look, Pixels, layers_of
 from crossgrad_plugins.view.sources import Source
 from crossgrad_plugins.view.training import Training
 
+#: The page draws at most this many cameras and points.
+_MOST_CAMERAS, _MOST_POINTS = 1_000, 200_000
 #: A camera is still if it has not moved for this many seconds.
 STILL_AFTER: Final = 0.2
 #: Seconds of a frame while the camera moves; the size of these frames is adapted to it.
@@ -44,24 +49,27 @@ class Stage:
     Attributes:
         sources: Returns the present sources.
         world: Maps the coordinates of the page to input coordinates.
-        views: The views whose cameras are shown, in the coordinates of the page.
-        first: The camera at which a page opens.
-        spacing: Size of the drawn cameras.
-        points: [P, 3] points to show, and their colours [P, 3]; None to show none.
-        folder: Folder for camera paths.
+        scene: The scene whose cameras are shown, in the coordinates of the page; None for a file.
         command: Start of the command that renders a path; None without a run.
         training: The run in training; None for a viewer of results.
     """
 
     sources: Callable[[], list[Source]]
     world: Similarity
-    views: list[View]
-    first: Camera
-    spacing: float
-    points: tuple[NDArray[np.float64], NDArray[np.uint8]] | None
-    folder: Path
-    command: str | None
+    scene: Scene | None = None
+    command: str | None = None
     training: Training | None = None
+
+    @cached_property
+    def views(self) -> tuple[View, ...]:
+        """The views whose cameras are shown."""
+        views = () if self.scene is None else self.scene.views
+        return views[:: -(-len(views) // _MOST_CAMERAS) or 1]
+
+    @cached_property
+    def spacing(self) -> float:
+        """The length of a drawn camera."""
+        return spacing_of(self.views)
 
 
 @dataclass(eq=False)
@@ -107,7 +115,8 @@ class Session:
         if views:
             self.go_to(views[0])
         else:
-            self._move(self.stage.first)
+            camera = free_camera()
+            self._move(camera, ahead=float(camera.center.norm()))
         self._read_camera()
 
     async def _camera_moved(self, _camera: object) -> None:
@@ -179,21 +188,24 @@ class Session:
 
     def _look(self, sources: list[Source]) -> Look:
         layers = {layer.label(len(sources)): layer for layer in layers_of(sources)}
-        named: list[Layer] = [layers[self._controls[side].value] for side in ("left", "right")]
+        left, right = (layers[self._controls[side].value] for side in ("left", "right"))
         split, exposure = self._controls["split"].value, self._controls["exposure"].value
-        return Look(*named, float(split), bool(exposure))
+        return Look(left, right, float(split), bool(exposure))
 
     def go_to(self, view: View) -> None:
         """Move the camera to a view; its photo can then be compared with the render."""
         self.view = view
         if self._controls["camera"].value != view.name:
             self._controls["camera"].value = view.name
-        self._move(view.camera)
+        scene = self.stage.scene
+        otherwise = 10 * self.stage.spacing
+        points = np.zeros((0, 3)) if scene is None else scene.points
+        self._move(view.camera, distance_ahead(view, points, otherwise))
 
-    def _move(self, camera: Camera) -> None:
+    def _move(self, camera: Camera, ahead: float) -> None:
+        """Move the camera; the user then turns around the point at a distance ahead of it."""
         handle, window = self.client.camera, camera_of(self.client.camera)
         center, pose = camera.center.numpy(), camera.world_to_camera[:3, :3].numpy()
-        ahead = self.stage.spacing * 10
         with self.client.atomic():
             handle.wxyz = quaternion_of(camera)
             handle.position = center
@@ -203,8 +215,9 @@ class Session:
     def _add_controls(self) -> None:
         gui, sources = self.client.gui, self.stage.sources()
         two = len(sources) > 1
-        letters = "AB" if two else " "
-        titles = [f"{letter}: {s.title}" if two else s.title for letter, s in zip(letters, sources)]
+        titles = [
+            f"{'AB'[number]}: {s.title}" if two else s.title for number, s in enumerate(sources)
+        ]
         gui.add_markdown("  \n".join(titles))
         if self.stage.training is not None:
             self._add_training(self.stage.training)
@@ -268,11 +281,15 @@ class Session:
             )
             node.on_click(lambda _event, view=view: self.go_to(view))
             self._nodes.append(node)
-        if stage.points is not None:
-            places, colors = stage.points
-            size = stage.spacing / 15
+        drawn = any(source.draw is not None for source in stage.sources())
+        if stage.scene is not None and not drawn:
+            kept = slice(None, None, -(-len(stage.scene.points) // _MOST_POINTS) or 1)
             scene.add_point_cloud(
-                "/points", places.astype(np.float32), colors, point_size=size, precision="float32"
+                "/points",
+                stage.scene.points[kept].astype(np.float32),
+                stage.scene.point_colors[kept],
+                point_size=stage.spacing / 15,
+                precision="float32",
             )
 
     def _show_nodes(self, *, visible: bool) -> None:
@@ -303,7 +320,7 @@ class Session:
             self._say_path("A path needs two keyframes: move the camera, and add another one")
             return
         try:
-            path = write_camera_path(self.stage.folder, self._keyframes, self.stage.world)
+            path = write_camera_path(Path.cwd(), self._keyframes, self.stage.world)
         except UserError as error:
             self._say_path(str(error))
             return
