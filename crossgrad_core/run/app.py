@@ -299,8 +299,9 @@ def _check_observers(setup: Setup) -> None:
     Raises:
         UserError: See `Observer.check`.
     """
-    for name in (choice.name for choice in setup.config.observers):
-        cast("Observer", setup.plugins[name]).check()
+    for plugin in setup.plugins.values():
+        if isinstance(plugin, Observer):
+            plugin.check()
 
 
 def with_defaults(config: RunConfig) -> RunConfig:
