@@ -338,8 +338,8 @@ class Session:
         gui = self.client.gui
         with gui.add_folder("Training"):
             self._controls["progress"] = gui.add_markdown(training.text)
-            pause = gui.add_button("Pause")
-            pause.on_click(lambda _event: self._pause(training, pause))
+            self._controls["pause"] = gui.add_button("Pause")
+            self._controls["pause"].on_click(lambda _event: self._pause(training))
             gui.add_button("Stop", hint="Save, evaluate and end; --resume continues").on_click(
                 lambda _event: self._stop(training)
             )
@@ -350,12 +350,11 @@ class Session:
                     series,
                     scales={"x": {"time": False}},
                     title=f"{name} of {'training' if name == 'loss' else 'held-out'} views",
-                    aspect=2.0,
+                    aspect=3.0,
                 )
 
-    def _pause(self, training: Training, button: Any) -> None:  # noqa: ANN401 - a viser handle
+    def _pause(self, training: Training) -> None:
         training.paused = not training.paused
-        button.label = "Resume" if training.paused else "Pause"
         self.wake()
 
     def _stop(self, training: Training) -> None:
@@ -365,5 +364,6 @@ class Session:
     def refresh(self, training: Training) -> None:
         """Show the present progress and curves."""
         self._controls["progress"].content = training.text
+        self._controls["pause"].label = "Resume" if training.paused else "Pause"
         self._controls["loss"].data = Training.curve(training.losses)
         self._controls["PSNR (dB)"].data = Training.curve(training.scores)
