@@ -130,7 +130,12 @@ class LiveViewer(Observer):
             return "stop"
         if viewer.connected and (training.paused or self._allowed > 0.0):
             begun = perf_counter()
-            self._draw(viewer, training, model)
+            try:
+                self._draw(viewer, training, model)
+            except Exception as error:  # An observer must not end a run.
+                _LOG.warning("the viewer ended: %s: %s", type(error).__name__, error)
+                self.crossgrad_run_end("failed")
+                return None
             self._allowed -= 0.0 if training.paused else perf_counter() - begun
         if training.paused:
             viewer.wait(_WAIT)
