@@ -19,7 +19,7 @@ class Window:
 
     def __init__(self, socket):
         self._socket = socket
-        self._frames = []
+        self.frames = []
         self.gui = {}
         self.files = {}
 
@@ -67,7 +67,7 @@ class Window:
     def _note(self, message):
         if message["type"] == "BackgroundImageMessage" and message["rgb_data"]:
             image = Image.open(io.BytesIO(message["rgb_data"])).convert("RGB")
-            self._frames.append((message["format"], np.asarray(image)))
+            self.frames.append((message["format"], np.asarray(image)))
         elif message["type"] == "FileTransferPart":
             self.files[message["transfer_uuid"]] = message["content"]
         label = (message.get("props") or {}).get("label")
@@ -84,13 +84,13 @@ class Window:
 
     def still(self):
         """Return the next frame without loss."""
-        self._frames.clear()
-        return self.until(lambda: [image for kind, image in self._frames if kind == "png"])[-1]
+        self.frames.clear()
+        return self.until(lambda: [image for kind, image in self.frames if kind == "png"])[-1]
 
     def frame(self):
         """Return the next frame of any kind."""
-        self._frames.clear()
-        return self.until(lambda: self._frames)[-1][1]
+        self.frames.clear()
+        return self.until(lambda: self.frames)[-1][1]
 
 
 def _messages(raw):
