@@ -96,7 +96,7 @@ def serve(scene: Path, max_size: int, cache_mib: int) -> None:
         "densifier": {"name": "none"},
         "data": {"max_size": max_size or None, "cache_mib": cache_mib},
     }
-    setup, _ = set_up(parsed(settings), -1)
+    setup, _ = set_up(parsed(settings))
     keep = fits(setup.scene, cache_mib)
     check_photos(setup.scene.views if keep else setup.scene.test_views, keep=keep)
     warm_up(setup)

@@ -70,7 +70,9 @@ if TYPE_CHECKING:
     from crossgrad_core.run.assemble import accepts, assemble
     from crossgrad_core.run.decisions import DEFAULT_STEPS, facts_of, table_of
     from crossgrad_core.run.load_run import opened as open_run
-    from crossgrad_core.run.results.panels import panels_of, read_panel
+    from crossgrad_core.run.rasterizers import Wanted as RasterizerDemands
+    from crossgrad_core.run.rasterizers import choose_rasterizer
+    from crossgrad_core.run.results.panels import error_map, panels_of, read_panel
     from crossgrad_core.run.results.reading import RunResults, find_runs
     from crossgrad_core.run.results.reading import read_run as read_results
     from crossgrad_core.run.select import views_per_step_of
@@ -81,7 +83,7 @@ if TYPE_CHECKING:
     from crossgrad_core.training.setup import Setup
     from crossgrad_core.training.start import first_state as begin
     from crossgrad_core.training.state import NonFiniteError, TrainingFailedError, TrainState
-    from crossgrad_core.training.step import model_of
+    from crossgrad_core.training.step import evaluated_model, model_of
 
 __all__ = [
     "COMMANDS",
@@ -98,6 +100,7 @@ __all__ = [
     "GroupedCommand",
     "NonFiniteError",
     "Progress",
+    "RasterizerDemands",
     "RunConfig",
     "RunResults",
     "Setup",
@@ -120,6 +123,7 @@ __all__ = [
     "check_folder",
     "check_new",
     "check_unchanged",
+    "choose_rasterizer",
     "chosen",
     "clear_half_written",
     "command_of",
@@ -131,6 +135,8 @@ __all__ = [
     "disk_full",
     "drop_checksums",
     "entries",
+    "error_map",
+    "evaluated_model",
     "exit_code",
     "facts_of",
     "find_runs",
@@ -196,6 +202,7 @@ _LATE: Final = {
     "ComponentChoice": "config",
     "DEFAULT_STEPS": "run.decisions",
     "NonFiniteError": "training.state",
+    "RasterizerDemands": "run.rasterizers:Wanted",
     "RunConfig": "config",
     "RunResults": "run.results.reading",
     "Setup": "training.setup",
@@ -204,6 +211,9 @@ _LATE: Final = {
     "accepts": "run.assemble",
     "assemble": "run.assemble",
     "begin": "training.start:first_state",
+    "error_map": "run.results.panels",
+    "choose_rasterizer": "run.rasterizers",
+    "evaluated_model": "training.step",
     "facts_of": "run.decisions",
     "find_runs": "run.results.reading",
     "gathered": "gradients.separate:DenseGradients",

@@ -32,6 +32,11 @@ RECIPE: Final = "auto"
 PLANNER: Final = "scene"
 #: Observer of every run.
 PROGRESS: Final = "progress"
+#: Observer of `crossgrad run --view`.
+VIEWER: Final = "view"
+#: Observers that only show the run to the user. They belong to the command, so that config.yaml
+#: does not name them.
+DISPLAYS: Final = frozenset({PROGRESS, VIEWER})
 
 #: The rasterizer that checks of plugins use, and the densifier that makes no edits.
 REFERENCE_RASTERIZER: Final = "torch"

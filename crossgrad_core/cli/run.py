@@ -6,22 +6,35 @@ The options are generated from the fields of the settings classes.
 from collections.abc import Callable, Iterator, Mapping
 from inspect import Parameter, Signature
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
 from crossgrad_core.config import CHANGEABLE
 from crossgrad_core.contract.flags import CONFIGURATION, HEADINGS, RESULTS, SCENE
-from crossgrad_core.defaults import PREPARING_READER
+from crossgrad_core.defaults import PREPARING_READER, VIEWER
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.options import OPTIONS, Option
 from crossgrad_core.system.command_options import print_all_options
 from crossgrad_core.system.startup import announce
 from crossgrad_core.wording import listed
 
+if TYPE_CHECKING:
+    from crossgrad_core.config import ComponentChoice
+
 #: Options that apply to one call of `crossgrad run` only. A resumed run may get other values.
 _OF_THE_COMMAND: Final = frozenset(
-    {"resume", "accept_scene", "accept_plugins", "check", "quiet", "verbose"}
+    {
+        "resume",
+        "accept_scene",
+        "accept_plugins",
+        "check",
+        "quiet",
+        "verbose",
+        "view",
+        "host",
+        "port",
+    }
 )
 
 
@@ -43,7 +56,7 @@ def refuse_beside_resume(run: Path, given: Mapping[str, object]) -> None:
             "settings and the scene cannot be changed when a run is resumed",
             where=listed(typed),
             expected="--device, --threads, --stop-after, --accept-scene, --accept-plugins, "
-            "--check, -q and -v only",
+            "--check, --view, -q and -v only",
             todo=f"leave {'it' if len(typed) == 1 else 'them'} out to continue {run}, or leave "
             "--resume out to start a new run",
         )
@@ -152,6 +165,30 @@ _LAST: Final = (
         common=False,
         help="Decode all photos before training, to find damaged photos early.",
     ),
+    _own(
+        "view",
+        bool,
+        "--view",
+        help="Show the run in a browser while it trains; the output names the address. Needs "
+        "the extra view.",
+    ),
+    _own(
+        "host",
+        str | None,
+        "--host",
+        metavar="ADDRESS",
+        common=False,
+        help="With --view: address that the viewer listens on. Default: 127.0.0.1, which only "
+        "this machine reaches.",
+    ),
+    _own(
+        "port",
+        int | None,
+        "--port",
+        metavar="N",
+        common=False,
+        help="With --view: port of the viewer. Default: 8080.",
+    ),
     _own("quiet", bool, "--quiet", "-q", help="Print only errors and the result."),
     _own("verbose", bool, "--verbose", "-v", help="Print every decision and event."),
     _parameter(
@@ -229,6 +266,7 @@ def run(**given: Any) -> None:  # noqa: ANN401 - typed by the schema
 
     from crossgrad_core.run import app
 
+    viewer = _viewer(**{name: given[name] for name in ("view", "host", "port")})
     try:
         code = app.run(
             wanted,
@@ -238,9 +276,26 @@ def run(**given: Any) -> None:  # noqa: ANN401 - typed by the schema
             accept_scene=given["accept_scene"],
             accept_plugins=given["accept_plugins"],
             check=given["check"],
+            viewer=viewer,
         )
     except UserError as error:
         if config is not None:
             name_file(error, config, settings, assignments)
         raise
     raise typer.Exit(code)
+
+
+def _viewer(*, view: bool, host: str | None, port: int | None) -> "ComponentChoice | None":
+    """Return the observer of `--view`; None without `--view`."""
+    from crossgrad_core.config import ComponentChoice
+
+    options = {name: value for name, value in (("host", host), ("port", port)) if value is not None}
+    if view:
+        return ComponentChoice.model_validate({"name": VIEWER, **options})
+    if options:
+        raise UserError(
+            f"--{min(options)} has no effect without --view",
+            where=f"--{min(options)}",
+            todo="add --view, or leave it out",
+        )
+    return None

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Literal, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -485,6 +485,10 @@ class Model:
     exposed: ExposedBy = field(default=unexposed)
     rule: AdamRule = field(default=AdamRule())
     render: RenderOnRequest = field(default=no_renders)
+
+
+#: Answer of `crossgrad_between_steps`.
+BetweenSteps = Literal["pause", "stop"]
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ may wrap these hooks (`@hookimpl(wrapper=True)`) to watch a call or replace its 
 first-result hook must return a value; None is an error.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 from crossgrad_core.contract.component import hookspec
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
         AggregateContext,
         AggregateResult,
         Answer,
+        BetweenSteps,
         DensifyContext,
         DensifyResult,
         EvaluationReport,
@@ -140,6 +141,15 @@ class HookSpecs:
     @hookspec
     def crossgrad_model_ready(self, model: "Model") -> None:
         """Event: the step is complete. The model is read-only; training time excludes this hook."""
+
+    @hookspec
+    def crossgrad_between_steps(self, model: "Callable[[], Model]") -> "BetweenSteps | None":
+        """Return `pause` to call this hook again before the next step, `stop` to end the run.
+
+        All plugins answer this hook after each step; None continues. `model()` returns the
+        read-only model as evaluations use it. The call brings all parameters up to date, so a
+        plugin calls it only if it needs the model. Training time excludes this hook.
+        """
 
     @hookspec
     def crossgrad_eval_parameters(

@@ -14,7 +14,8 @@ import numba
 import numpy as np
 import torch
 
-from crossgrad_core.config import AUTO, RunConfig
+from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
+from crossgrad_core.contract.slots.observer import Observer
 from crossgrad_core.defaults import PREPARING_READER
 from crossgrad_core.errors import UserError
 from crossgrad_core.recipe.table import open_again, short_lines
@@ -29,7 +30,7 @@ from crossgrad_core.run.finish import (
     reason_of,
     resume_line,
 )
-from crossgrad_core.run.load_run import continued, set_up
+from crossgrad_core.run.load_run import Displays, continued, progress_at, set_up
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.run.results.config_file import FILE as CONFIG
 from crossgrad_core.run.results.config_file import as_yaml, read_config, write_config
@@ -171,6 +172,7 @@ def run(  # noqa: PLR0913 - one parameter per option of the command line
     accept_scene: bool = False,
     accept_plugins: bool = False,
     check: bool = False,
+    viewer: ComponentChoice | None = None,
 ) -> int:
     """Train, evaluate, export, and print the results, as `crossgrad run` does.
 
@@ -183,6 +185,7 @@ def run(  # noqa: PLR0913 - one parameter per option of the command line
             resumed run: continue although photos, masks or points of the scene have changed.
         accept_plugins: Continue with other versions of the packages that train the run.
         check: Decode all photos before training.
+        viewer: The observer of `--view`.
 
     Returns:
         The exit code: 0; 1 if training failed; 128 plus the signal's number if a signal stopped the
@@ -191,7 +194,7 @@ def run(  # noqa: PLR0913 - one parameter per option of the command line
     Raises:
         UserError: The input is invalid; nothing was written.
     """
-    way = Way(verbosity, _print_results, check)
+    way = Way(verbosity, _print_results, check, viewer)
     if resume is not None:
         accepted = {"accept_scene": accept_scene, "accept_plugins": accept_plugins}
         return _end(resumed(resume, settings, way, **accepted), way)
@@ -224,11 +227,19 @@ class Way:
         verbosity: -1 quiet, 0 normal, 1 verbose.
         tell: Function that receives the results.
         check: True to decode all photos before training, False for the held-out photos only.
+        viewer: The observer of `--view`.
     """
 
     verbosity: int
     tell: Tell
     check: bool = False
+    viewer: ComponentChoice | None = None
+
+    @property
+    def displays(self) -> Displays:
+        """The observers that show the run to the user."""
+        progress = progress_at(self.verbosity)
+        return (progress,) if self.viewer is None else (progress, self.viewer)
 
 
 def new(settings: Mapping[str, Any], way: Way) -> Outcome:
@@ -274,13 +285,25 @@ def _checked(settings: Mapping[str, Any], way: Way) -> tuple[Setup, float]:
     config = with_defaults(parsed(with_recipe(settings)))
     check_out(config.out)
     check_folder(config.out or RUNS, SMALLEST_NEED)
-    setup, load_seconds = set_up(config, way.verbosity)
+    setup, load_seconds = set_up(config, way.displays)
     check_clock(config)
     refuse_labels_for_nothing(setup)
     refuse_settings_for_nothing(open_again(config), setup)
     known_starts(setup)
     check_largest_draw(setup)
+    _check_observers(setup)
     return setup, load_seconds + _decoded(setup, way)
+
+
+def _check_observers(setup: Setup) -> None:
+    """Refuse a run whose observers cannot work on this machine.
+
+    Raises:
+        UserError: See `Observer.check`.
+    """
+    for plugin in setup.plugins.values():
+        if isinstance(plugin, Observer):
+            plugin.check()
 
 
 def with_defaults(config: RunConfig) -> RunConfig:
@@ -434,7 +457,7 @@ def resumed(
     # run.
     read_config(folder)
     with resume_hint(resume_line(folder)), _held(folder):
-        setup, state = continued(folder, settings, way.verbosity, **accepted)
+        setup, state = continued(folder, settings, way.displays, **accepted)
         step, total = state.step, setup.schedule.total
         done = step >= total and summarised_step(folder, "finished") == step
         files = PER_VIEW, f"{CLOUD}.{setup.selection.exporter.suffix}"
@@ -458,6 +481,7 @@ def resumed(
                 found=str(stop),
                 todo="name a step in this range, or leave --stop-after out to train to the end",
             )
+        _check_observers(setup)
         if step < total:
             state.clock.load += _decoded(setup, way)
             with _tried_out():

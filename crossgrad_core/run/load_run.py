@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Final, cast
+from typing import Any, Final, TypeAlias, cast
 
 from crossgrad_core import defaults
 from crossgrad_core.config import CHANGEABLE, ComponentChoice, RunConfig
@@ -349,9 +349,19 @@ _WITH_RESULTS: Final[tuple[Status, ...]] = ("finished", "stopped")
 BEGINS_AGAIN = "no checkpoint yet: the run starts again from its configuration"
 
 
+#: Choices of the observers that show a run to the user.
+Displays: TypeAlias = tuple[ComponentChoice, ...]
+
+
+def progress_at(verbosity: int) -> ComponentChoice:
+    """Return the progress display at a verbosity: -1 quiet, 0 normal, 1 verbose."""
+    level = {-1: "quiet", 0: "normal", 1: "verbose"}[verbosity]
+    return ComponentChoice.model_validate({"name": PROGRESS, "level": level})
+
+
 def set_up(
     config: RunConfig,
-    verbosity: int,
+    displays: Displays = (),
     check: Callable[[Fingerprint], tuple[str, ...]] | None = None,
     *,
     looks: bool = False,
@@ -360,7 +370,7 @@ def set_up(
 
     Args:
         config: The configuration, with a scene.
-        verbosity: -1 quiet, 0 normal, 1 verbose.
+        displays: The observers that show the run to the user.
         check: Refuses a scene that is not the run's scene; returns notes about an accepted scene.
         looks: True if nothing will be trained; the consistency check of the scene is then omitted.
 
@@ -380,10 +390,9 @@ def set_up(
     )
     notes = () if check is None else check(fingerprint_of(scene, path))
     scene = replace(scene, notes=(*notes, *scene.notes))
-    level = {-1: "quiet", 0: "normal", 1: "verbose"}[verbosity]
-    if not any(choice.name == PROGRESS for choice in config.observers):
-        progress = ComponentChoice.model_validate({"name": PROGRESS, "level": level})
-        config = config.model_copy(update={"observers": (*config.observers, progress)})
+    chosen = {choice.name for choice in config.observers}
+    added = tuple(choice for choice in displays if choice.name not in chosen)
+    config = config.model_copy(update={"observers": (*config.observers, *added)})
     setup = assemble(config, scene, reader)
     return setup, perf_counter() - start
 
@@ -446,13 +455,14 @@ def opened(
     packages = read_plugins(folder)
     refuse_missing(folder, packages, optional=REPLACEABLE)
     report_changed(packages)
-    return _from(folder, {"threads": None, **settings}, -1, check, packages, looks=True)
+    quiet = (progress_at(-1),)
+    return _from(folder, {"threads": None, **settings}, quiet, check, packages, looks=True)
 
 
 def continued(
     folder: Path,
     settings: Mapping[str, Any],
-    verbosity: int,
+    displays: Displays,
     *,
     accept_scene: bool = False,
     accept_plugins: bool = False,
@@ -464,7 +474,7 @@ def continued(
     Args:
         folder: The run's folder.
         settings: Only `device`, `threads` and `stop_after` may differ from the run's own settings.
-        verbosity: -1 quiet, 0 normal, 1 verbose.
+        displays: The observers that show the run to the user.
         accept_scene: Accept a scene whose photos, masks or points have changed.
         accept_plugins: Accept other versions of the packages that train the run.
 
@@ -478,9 +488,9 @@ def continued(
     if named_checkpoints(folder / CHECKPOINTS):
         if not accept_plugins:
             refuse_changed(folder, packages)
-        return _from(folder, settings, verbosity, check, packages)
+        return _from(folder, settings, displays, check, packages)
     _refuse_lost_checkpoints(folder)
-    setup, seconds = set_up(_config(folder, settings), verbosity)
+    setup, seconds = set_up(_config(folder, settings), displays)
     state = first_state(setup)
     state.clock.load = seconds
     return replace(setup, notes=(BEGINS_AGAIN, *_noted(folder, setup, None))), state
@@ -489,7 +499,7 @@ def continued(
 def _from(
     folder: Path,
     settings: Mapping[str, Any],
-    verbosity: int,
+    displays: Displays,
     check: Callable[[Fingerprint], tuple[str, ...]],
     packages: Packages | None,
     *,
@@ -500,7 +510,7 @@ def _from(
     # file at any time, and older settings stay valid.
     config = _config(folder, settings)
     config_now = without_missing(config) if looks else config
-    setup, seconds = set_up(config_now, verbosity, check, looks=looks)
+    setup, seconds = set_up(config_now, displays, check, looks=looks)
     check_settings(as_it_was(setup.config, config), checkpoint)
     state = from_checkpoint(setup, checkpoint)
     state.clock.load += seconds

@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.component import Component
-from crossgrad_core.defaults import PROGRESS
+from crossgrad_core.defaults import DISPLAYS
 from crossgrad_core.training.setup import Setup
 
 #: Slots that every run fills with one component.
@@ -39,7 +39,7 @@ def resolved(setup: Setup) -> RunConfig:
             "operator": _operator(config, setup),
             "reader": config.reader.model_copy(update={"name": names["reader"]}),
             "metrics": tuple(_choice(name, metric) for name, metric in selection.metrics.items()),
-            "observers": tuple(c for c in config.observers if c.name != PROGRESS),
+            "observers": tuple(c for c in config.observers if c.name not in DISPLAYS),
             "rules": {name: _options(selection.rules.get(name)) for name in config.rules},
             "scene": scene,
             "data": data.model_copy(update=located),

@@ -10,7 +10,7 @@ from pathlib import Path
 from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
 from crossgrad_core.contract.objections import set_for_nothing
 from crossgrad_core.contract.scene_options import SceneOptions
-from crossgrad_core.defaults import GROUP_SAMPLER, PLAIN_INITIALIZER, PROGRESS
+from crossgrad_core.defaults import DISPLAYS, GROUP_SAMPLER, PLAIN_INITIALIZER
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import reasons_against, refuse
@@ -179,7 +179,7 @@ def _of_groups(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
     """Yield the grouping if the user named a grouping that no component reads."""
     selection = setup.selection
     sampler, operator = selection.sampler, selection.operator
-    watched = any(choice.name != PROGRESS for choice in config.observers)
+    watched = any(choice.name not in DISPLAYS for choice in config.observers)
     named = config.grouping is not None and config.grouping.name != AUTO
     if not named or sampler.reads_groups or watched:
         return

@@ -8,7 +8,7 @@ from itertools import count, pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import MappingProxyType
-from typing import Any, TypeAlias, cast
+from typing import Any, TypeAlias, cast, get_args
 
 import torch
 from torch import Tensor
@@ -21,6 +21,7 @@ from crossgrad_core.contract.contexts import (
     AggregateContext,
     AggregateResult,
     Answer,
+    BetweenSteps,
     DensifyContext,
     DensifyResult,
     EvaluationReport,
@@ -186,6 +187,7 @@ def _require_survival(hooks: Hooks, observer: Observer, step: int) -> None:
     try:
         _step_end(hooks, step, _step_hooks(hooks, observer, step))
         hooks.crossgrad_model_ready(model=_model(step))
+        hooks.crossgrad_between_steps(model=lambda: _model(step))
     except ContractError:
         raise
     except (Exception, SystemExit) as error:
@@ -204,6 +206,9 @@ def the_model_stays_untouched(make: Make[Observer]) -> None:
             model = _model(step)
             _step_end(hooks, step, [])
             hooks.crossgrad_model_ready(model=model)
+            for answer in hooks.crossgrad_between_steps(model=lambda model=model: model):
+                known = answer in get_args(BetweenSteps)
+                require(known, f"crossgrad_between_steps returns {answer!r}")
             _require_new(model, step)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
+from functools import partial
 from types import FrameType
 from typing import Any, Literal, Protocol
 
@@ -14,6 +15,7 @@ import numpy as np
 from crossgrad_core.contract.blocks import EMPTY_STATE, PluginState
 from crossgrad_core.contract.contexts import StepRecord
 from crossgrad_core.contract.slots.sampler import STATE
+from crossgrad_core.registry.manager import wrong_answer
 from crossgrad_core.system.allocator import use_large_pages
 from crossgrad_core.system.interrupts import end_at_once, signal_names, tell
 from crossgrad_core.training.setup import Setup
@@ -27,7 +29,7 @@ from crossgrad_core.training.state import (
     check_start,
     is_whole,
 )
-from crossgrad_core.training.step import model_of, sample_context, take_step
+from crossgrad_core.training.step import evaluated_model, model_of, sample_context, take_step
 from crossgrad_core.training.views import photo_camera
 
 #: Messages after the first and after the second signal. A third signal ends the process at once.
@@ -49,11 +51,13 @@ class Stopper:
         at_once: True after a second signal. If `at_once` is True, optional work, such as the
             evaluation, is skipped.
         error: Error from outside the training step that ends the run; None without an error.
+        stopped: True if a plugin ended the run between two steps.
     """
 
     signal: int | None = None
     at_once: bool = False
     error: Exception | None = None
+    stopped: bool = False
     _interruptible: bool = field(default=False, repr=False)
     _count: int = field(default=0, repr=False)
     _before: dict[int, Any] = field(default_factory=dict, repr=False)
@@ -61,7 +65,7 @@ class Stopper:
     @property
     def requested(self) -> bool:
         """True if training must stop after the present step."""
-        return self.signal is not None or self.error is not None
+        return self.signal is not None or self.error is not None or self.stopped
 
     def fail(self, error: Exception) -> None:
         """Request the end of the run after the present step, because a thread raised an error."""
@@ -290,12 +294,25 @@ def _steps(
             setup.hook.crossgrad_model_ready(model=model_of(setup, state))
         _tell_held_back(setup, record)
         _record(setup, state, sink)
+        if setup.acts_between_steps:
+            _between_steps(setup, state, stopper)
         pausing = pauses is not None and state.step < last and pauses(state)
         if pausing and _is_good(setup, state, sink, guard):
             return "paused"
     # A signal may have arrived after the last check inside the loop.
     _is_good(setup, state, sink, guard)
     return "finished" if state.step >= total else "stopped"
+
+
+def _between_steps(setup: Setup, state: TrainState, stopper: Stopper) -> None:
+    """Call the plugins between two steps, again and again while a plugin pauses the run."""
+    hook, model = setup.hook.crossgrad_between_steps, partial(evaluated_model, setup, state)
+    answers = ["pause"]
+    while "pause" in answers and not stopper.requested:
+        answers = hook(model=model)
+        if unknown := set(answers) - {"pause", "stop"}:
+            raise wrong_answer(hook, "`pause`, `stop` or None", repr(unknown))
+        stopper.stopped = stopper.stopped or "stop" in answers
 
 
 def timed_step(setup: Setup, state: TrainState) -> StepRecord:

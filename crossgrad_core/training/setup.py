@@ -364,6 +364,11 @@ class Setup:
         return bool(self.hook.crossgrad_model_ready.get_hookimpls())
 
     @cached_property
+    def acts_between_steps(self) -> bool:
+        """True if any plugin acts between two steps."""
+        return bool(self.hook.crossgrad_between_steps.get_hookimpls())
+
+    @cached_property
     def acts_after_step(self) -> bool:
         """True if a plugin implements the hook `crossgrad_after_step`."""
         return bool(self.hook.crossgrad_after_step.get_hookimpls())

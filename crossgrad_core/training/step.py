@@ -87,6 +87,15 @@ def model_of(setup: Setup, state: TrainState) -> Model:
     )
 
 
+def evaluated_model(setup: Setup, state: TrainState) -> Model:
+    """Return the model after the last step as evaluations use it, averaged parameters included."""
+    return replace(
+        model_of(setup, state),
+        phase=setup.phase(state.step, training=False),
+        parameters=eval_parameters(setup, state),
+    )
+
+
 #: `GROUPING`: key of the state that contains the labels, and name of the grouping's random stream.
 #: `_LABELS`: key of the labels in this state.
 GROUPING = "grouping"
@@ -254,13 +263,7 @@ def final_edits(setup: Setup, state: TrainState) -> Iterator[FinalEdit]:
         UserError: An edit does not match the parameters.
     """
     for hook in one_by_one(setup.manager, "crossgrad_final_edit"):
-        shown = eval_parameters(setup, state)
-        model = replace(
-            model_of(setup, state),
-            phase=setup.phase(state.step, training=False),
-            parameters=shown,
-        )
-        answers: list[object] = hook(model=model)
+        answers: list[object] = hook(model=evaluated_model(setup, state))
         for answer in answers:
             if not isinstance(answer, FinalEdit):
                 raise wrong_answer(hook, "a FinalEdit, or None", repr(answer))

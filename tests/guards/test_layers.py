@@ -46,6 +46,7 @@ PLACES = {
     "crossgrad_plugins.recipes.cli": COMMANDS_IMPORT,
     "crossgrad_plugins.scene_check": COMMANDS_IMPORT,
     "crossgrad_plugins.sweep": COMMANDS_IMPORT,
+    "crossgrad_plugins.view": COMMANDS_IMPORT,
     "crossgrad_operators.stress": COMMANDS_IMPORT,
 }
 #: Files at the top of the core.

@@ -21,3 +21,10 @@ class Observer(Component):
 
     slot: ClassVar[str] = "observers"
     needs_separate_gradients: ClassVar[bool] = False
+
+    def check(self) -> None:
+        """Check before training that the observer works on this machine; by default do nothing.
+
+        Raises:
+            UserError: The observer cannot work, for example because a package is not installed.
+        """

@@ -54,7 +54,6 @@ def test_a_default_run_minimizes_the_fused_loss(tmp_path):
     write_tiny_scene(tmp_path / "scene", views=4)
     setup, _ = set_up(
         parsed({"scene": str(tmp_path / "scene"), "loss": {"name": "l1-ssim", "ssim_weight": 0.4}}),
-        -1,
     )
     assert setup.loss == build("losses", "l1-ssim", {"ssim_weight": 0.4})
     assert setup.selection.names["loss"] == "l1-ssim"

@@ -280,7 +280,7 @@ def test_a_resumed_run_with_unused_settings_is_accepted(folders):
             "operator": {"name": "cagrad", "c": 0, "rescale": "1+c"},
         }
     )
-    set_up(config, -1)
+    set_up(config)
 
 
 @pytest.mark.parametrize("name", ["sum", "mean", "graddrop", "preconditioner"])
