@@ -1,0 +1,221 @@
+"""One HTML page that shows the Gaussians in any browser, without a network and without a library."""
+
+import json
+import zlib
+from base64 import b64encode
+from dataclasses import dataclass
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, ClassVar, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from crossgrad_core.numerics.raster_constants import ALPHA_THRESHOLD, JACOBIAN_MARGIN
+from crossgrad_core.plugin import (
+    Exporter,
+    ExportContent,
+    Gaussians,
+    Similarity,
+    UserError,
+    View,
+    atomic_file,
+)
+from crossgrad_plugins.exporters.ply_cloud import REST, SplatCloud
+
+#: Rules of drawing that a rasterizer has as options; the page uses their defaults.
+NEAR, DILATION, MAX_ALPHA = 1e-3, 0.3, 0.99
+#: The page holds all data in one text, and browsers limit a text to 512 MiB.
+MOST_GAUSSIANS: Final = 4_000_000
+_UNSIGNED, _SIGNED, _BYTE = 2**16 - 1, 2**15 - 1, 2**7 - 1
+#: Bytes of a texel of the texture with spherical harmonics; each degree needs one texel more.
+_TEXEL = 16
+
+
+@dataclass(frozen=True, eq=False)
+class QuantisedCloud:
+    """N Gaussians as integers, in the arrays that the page loads into textures.
+
+    Attributes:
+        means: [N, 3] float32, local frame.
+        harmonics: [N, 16 d] uint8 for degree d. The first bytes are the bands 1 to d as signed
+            bytes, coefficient by coefficient in the order RGB, in units of 1/127 of a range. The
+            last two bytes are this range as a half float.
+        scales: [N, 3] uint16, natural logarithms of the standard deviations within `scale_range`.
+        quats: [N, 4] int16, unit quaternions wxyz times 32767.
+        colors: [N, 4] uint16, band 0 within `color_range` (RGB), and opacity within 0 and 1.
+        degree: The highest degree with a non-zero coefficient.
+        scale_range: Smallest and largest logarithm.
+        color_range: Smallest and largest coefficient of band 0.
+        antialiased: True for the response `antialiased`, False for `plain`.
+        dilation: Dilation in px^2.
+    """
+
+    means: NDArray[np.float32]
+    harmonics: NDArray[np.uint8]
+    scales: NDArray[np.uint16]
+    quats: NDArray[np.int16]
+    colors: NDArray[np.uint16]
+    degree: int
+    scale_range: tuple[float, float]
+    color_range: tuple[float, float]
+    antialiased: bool
+    dilation: float
+
+    @classmethod
+    def from_gaussians(cls, gaussians: Gaussians) -> "QuantisedCloud":
+        """Quantise Gaussians, at least one; values that are not finite stay out of the ranges."""
+        cloud = SplatCloud.from_gaussians(gaussians)
+        scale_range, color_range = _range(cloud.log_scales), _range(cloud.sh_dc)
+        lengths = np.linalg.norm(cloud.quats, axis=1, keepdims=True)
+        units = cloud.quats / np.where(lengths > 0, lengths, 1)
+        opacities = gaussians.opacities.detach().cpu().numpy().reshape(-1, 1)
+        colors = [_unsigned(cloud.sh_dc, color_range), _unsigned(opacities, (0.0, 1.0))]
+        return cls(
+            means=cloud.means.astype("<f4"),
+            harmonics=_packed(cloud.sh_rest, cloud.sh_degree),
+            scales=_unsigned(cloud.log_scales, scale_range),
+            quats=_rounded(units * _SIGNED).astype("<i2"),
+            colors=np.concatenate(colors, 1),
+            degree=cloud.sh_degree,
+            scale_range=scale_range,
+            color_range=color_range,
+            antialiased=gaussians.response == "antialiased",
+            dilation=DILATION if gaussians.dilation is None else gaussians.dilation,
+        )
+
+    def to_gaussians(self) -> Gaussians:
+        """Return the Gaussians that the page draws, float32 on the CPU."""
+        colors = _real(self.colors[:, :3], self.color_range)
+        rest = _unpacked(self.harmonics, self.degree) if self.degree else None
+        return Gaussians(
+            means=torch.from_numpy(self.means.copy()),
+            quats=torch.from_numpy(self.quats.astype(np.float32) / _SIGNED),
+            scales=torch.from_numpy(np.exp(_real(self.scales, self.scale_range))),
+            opacities=torch.from_numpy(_real(self.colors[:, 3], (0.0, 1.0))),
+            sh_dc=torch.from_numpy(colors[:, None]),
+            sh_rest=None if rest is None else torch.from_numpy(rest),
+            sh_degree=self.degree,
+            response="antialiased" if self.antialiased else "plain",
+            dilation=self.dilation,
+        )
+
+    def packed(self) -> bytes:
+        """Return one zlib stream of all arrays, in the order in which the page reads them."""
+        arrays = (self.means, self.harmonics, self.scales, self.quats, self.colors)
+        # A higher level needs several times the time for 2 % fewer bytes.
+        return zlib.compress(b"".join(array.tobytes() for array in arrays), 1)
+
+
+class Html(Exporter):
+    """One HTML page with a viewer: a double click shows the scene, without a network."""
+
+    suffix: ClassVar[str] = "html"
+
+    @override
+    def write(self, content: ExportContent, path: Path) -> tuple[str, ...]:
+        number = len(content.gaussians)
+        if not 0 < number <= MOST_GAUSSIANS:
+            raise UserError(
+                "an HTML page cannot show this number of Gaussians",
+                where=path,
+                expected=f"1 to {MOST_GAUSSIANS:,} Gaussians",
+                found=f"{number:,}",
+                todo="export fewer Gaussians, or choose another --format",
+            )
+        cloud = QuantisedCloud.from_gaussians(content.gaussians)
+        page = files(__package__).joinpath("viewer.html").read_text(encoding="utf-8")
+        title, scene, data = "@TITLE@", "@SCENE@", "@DATA@"
+        head, _, rest = page.partition(title)
+        middle, _, rest = rest.partition(scene)
+        before, _, after = rest.partition(data)
+        parts = (head, escape(content.title), middle, _script_json(_facts(content, cloud)), before)
+        with atomic_file(path) as file:
+            file.write("".join(parts).encode())
+            file.write(b64encode(cloud.packed()))
+            file.write(after.encode())
+        return ()
+
+    @override
+    def stored(self, gaussians: Gaussians) -> Gaussians:
+        return QuantisedCloud.from_gaussians(gaussians).to_gaussians() if len(gaussians) else gaussians
+
+
+def _facts(content: ExportContent, cloud: QuantisedCloud) -> dict[str, Any]:
+    """Return what the page knows in addition to the arrays."""
+    cameras = [_camera(view) for view in content.views]
+    return {
+        "gaussians": len(cloud.means),
+        "degree": cloud.degree,
+        "scale_range": cloud.scale_range,
+        "color_range": cloud.color_range,
+        "antialiased": cloud.antialiased,
+        "dilation": cloud.dilation,
+        "near": NEAR,
+        "max_alpha": MAX_ALPHA,
+        "threshold": ALPHA_THRESHOLD,
+        "margin": JACOBIAN_MARGIN,
+        "offset": content.similarity.offset.tolist(),
+        "scale": content.similarity.scale,
+        "up": _up(content),
+        "comments": list(content.comments),
+        "cameras": cameras,
+    }
+
+
+def _camera(view: View) -> dict[str, Any]:
+    camera = view.camera
+    lens = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    pose = camera.world_to_camera[:3].tolist()
+    return {"name": view.name, "regime": view.regime, **lens, "world_to_camera": pose}
+
+
+def _script_json(value: object) -> str:
+    """Return JSON for a script element: no text inside can end the element or open a comment."""
+    return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")
+
+
+def _range(values: NDArray[np.float32]) -> tuple[float, float]:
+    finite = values[np.isfinite(values)]
+    return (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
+
+
+def _rounded(values: NDArray[Any]) -> NDArray[Any]:
+    return np.rint(np.nan_to_num(values, nan=0.0))
+
+
+def _unsigned(values: NDArray[Any], between: tuple[float, float]) -> NDArray[np.uint16]:
+    low, high = between
+    shares = np.clip((values - low) / ((high - low) or 1.0), 0.0, 1.0)
+    return _rounded(shares * _UNSIGNED).astype("<u2")
+
+
+def _real(stored: NDArray[np.uint16], between: tuple[float, float]) -> NDArray[np.float32]:
+    low, high = between
+    return (low + stored.astype(np.float64) / _UNSIGNED * (high - low)).astype(np.float32)
+
+
+def _packed(rest: NDArray[np.float32], degree: int) -> NDArray[np.uint8]:
+    """Return [N, 16 d] bytes of bands 1 to d of `rest` [N, 15, 3]."""
+    number, used = len(rest), 3 * ((degree + 1) ** 2 - 1)
+    values = np.nan_to_num(rest.reshape(number, 3 * REST)[:, :used])
+    # Most Gaussians have the range 1, so that their bytes are small numbers, which compress well.
+    largest = np.maximum(np.abs(values).max(axis=1, initial=0.0, keepdims=True), 1.0)
+    ranges = np.nextafter(largest.astype("<f2"), np.float16(np.inf))
+    ranges = np.where(largest > 1.0, ranges, np.float16(1.0)).astype("<f2")
+    table = np.zeros((number, _TEXEL * degree), dtype=np.uint8)
+    if degree:
+        steps = np.rint(values / ranges.astype(np.float32) * _BYTE).astype(np.int8)
+        table[:, :used] = steps.view(np.uint8)
+        table[:, -2:] = ranges.view(np.uint8)
+    return table
+
+
+def _unpacked(table: NDArray[np.uint8], degree: int) -> NDArray[np.float32]:
+    bands = (degree + 1) ** 2 - 1
+    ranges = np.ascontiguousarray(table[:, -2:]).view("<f2").astype(np.float32)
+    steps = np.ascontiguousarray(table[:, : 3 * bands]).view(np.int8).astype(np.float32)
+    return (steps / _BYTE * ranges).reshape(-1, bands, 3)
