@@ -156,6 +156,7 @@ def export_scene(
         placed.rotation @ scene.up,
         placed.to_ecef,
         tuple(comments),
+        scene.name,
     )
     notes = exporter.write(content, path)
     notes += (*placed.notes, *_write_georef(path, placed, exporter))

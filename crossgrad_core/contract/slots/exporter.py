@@ -42,6 +42,7 @@ class ExportContent:
         to_ecef: [4, 4] float64, maps coordinates of the file to ECEF metres on the WGS 84
             ellipsoid; None if the location is not known.
         comments: Lines of plain text about the file, for formats that can hold them.
+        name: Name of the scene.
     """
 
     gaussians: Gaussians
@@ -50,6 +51,7 @@ class ExportContent:
     up: NDArray[np.float64] | None = None
     to_ecef: NDArray[np.float64] | None = None
     comments: tuple[str, ...] = ()
+    name: str = "scene"
 
 
 class Exporter(Component):

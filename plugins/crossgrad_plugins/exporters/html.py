@@ -16,15 +16,16 @@ from typing_extensions import override
 
 from crossgrad_core.numerics.raster_constants import ALPHA_THRESHOLD, JACOBIAN_MARGIN
 from crossgrad_core.plugin import (
+    Camera,
     Exporter,
     ExportContent,
     Gaussians,
+    Response,
     Similarity,
     UserError,
-    View,
     atomic_file,
 )
-from crossgrad_plugins.exporters.ply_cloud import REST, SplatCloud
+from crossgrad_plugins.exporters.ply_cloud import SplatCloud
 
 #: Rules of drawing that a rasterizer has as options; the page uses their defaults.
 NEAR, DILATION, MAX_ALPHA = 1e-3, 0.3, 0.99
@@ -32,7 +33,8 @@ NEAR, DILATION, MAX_ALPHA = 1e-3, 0.3, 0.99
 MOST_GAUSSIANS: Final = 4_000_000
 _UNSIGNED, _SIGNED, _BYTE = 2**16 - 1, 2**15 - 1, 2**7 - 1
 #: Bytes of a texel of the texture with spherical harmonics; each degree needs one texel more.
-_TEXEL = 16
+#: Degrees 1, 2 and 3 have 3, 8 and 15 coefficients per channel, in 1, 2 and 4 groups of four.
+_TEXEL, _FULL = 16, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,10 +43,11 @@ class QuantisedCloud:
 
     Attributes:
         means: [N, 3] float32, local frame.
-        harmonics: [N, 16 d] uint8 for degree d. The first bytes are the bands 1 to d as signed
-            bytes, coefficient by coefficient in the order RGB, in units of 1/127 of a range. The
-            last two bytes are this range as a half float.
-        scales: [N, 3] uint16, natural logarithms of the standard deviations within `scale_range`.
+        harmonics: [N, 16 d] int8 for degree d: coefficients of the bands 1 to d in units of 1/127
+            of a range. Four coefficients of red are followed by the same four of green and of blue,
+            then by the next four of red; the rest is zero.
+        scales: [N, 4] uint16, natural logarithms of the three standard deviations within
+            `scale_range`, and the range of `harmonics` as the bits of a half float.
         quats: [N, 4] int16, unit quaternions wxyz times 32767.
         colors: [N, 4] uint16, band 0 within `color_range` (RGB), and opacity within 0 and 1.
         degree: The highest degree with a non-zero coefficient.
@@ -55,7 +58,7 @@ class QuantisedCloud:
     """
 
     means: NDArray[np.float32]
-    harmonics: NDArray[np.uint8]
+    harmonics: NDArray[np.int8]
     scales: NDArray[np.uint16]
     quats: NDArray[np.int16]
     colors: NDArray[np.uint16]
@@ -73,11 +76,13 @@ class QuantisedCloud:
         lengths = np.linalg.norm(cloud.quats, axis=1, keepdims=True)
         units = cloud.quats / np.where(lengths > 0, lengths, 1)
         opacities = gaussians.opacities.detach().cpu().numpy().reshape(-1, 1)
+        harmonics, ranges = _packed(cloud.sh_rest, cloud.sh_degree)
+        scales = [_unsigned(cloud.log_scales, scale_range), ranges.view("<u2")]
         colors = [_unsigned(cloud.sh_dc, color_range), _unsigned(opacities, (0.0, 1.0))]
         return cls(
             means=cloud.means.astype("<f4"),
-            harmonics=_packed(cloud.sh_rest, cloud.sh_degree),
-            scales=_unsigned(cloud.log_scales, scale_range),
+            harmonics=harmonics,
+            scales=np.concatenate(scales, 1),
             quats=_rounded(units * _SIGNED).astype("<i2"),
             colors=np.concatenate(colors, 1),
             degree=cloud.sh_degree,
@@ -90,11 +95,11 @@ class QuantisedCloud:
     def to_gaussians(self) -> Gaussians:
         """Return the Gaussians that the page draws, float32 on the CPU."""
         colors = _real(self.colors[:, :3], self.color_range)
-        rest = _unpacked(self.harmonics, self.degree) if self.degree else None
+        rest = _unpacked(self.harmonics, self.scales[:, 3:], self.degree) if self.degree else None
         return Gaussians(
             means=torch.from_numpy(self.means.copy()),
             quats=torch.from_numpy(self.quats.astype(np.float32) / _SIGNED),
-            scales=torch.from_numpy(np.exp(_real(self.scales, self.scale_range))),
+            scales=torch.from_numpy(np.exp(_real(self.scales[:, :3], self.scale_range))),
             opacities=torch.from_numpy(_real(self.colors[:, 3], (0.0, 1.0))),
             sh_dc=torch.from_numpy(colors[:, None]),
             sh_rest=None if rest is None else torch.from_numpy(rest),
@@ -114,6 +119,8 @@ class Html(Exporter):
     """One HTML page with a viewer: a double click shows the scene, without a network."""
 
     suffix: ClassVar[str] = "html"
+    lossy: ClassVar[bool] = True
+    responses: ClassVar[frozenset[Response]] = frozenset({"plain", "antialiased"})
 
     @override
     def write(self, content: ExportContent, path: Path) -> tuple[str, ...]:
@@ -132,7 +139,7 @@ class Html(Exporter):
         head, _, rest = page.partition(title)
         middle, _, rest = rest.partition(scene)
         before, _, after = rest.partition(data)
-        parts = (head, escape(content.title), middle, _script_json(_facts(content, cloud)), before)
+        parts = (head, escape(content.name), middle, _script_json(_facts(content, cloud)), before)
         with atomic_file(path) as file:
             file.write("".join(parts).encode())
             file.write(b64encode(cloud.packed()))
@@ -140,13 +147,14 @@ class Html(Exporter):
         return ()
 
     @override
-    def stored(self, gaussians: Gaussians) -> Gaussians:
-        return QuantisedCloud.from_gaussians(gaussians).to_gaussians() if len(gaussians) else gaussians
+    def stored(self, gaussians: Gaussians, similarity: Similarity) -> Gaussians:
+        return QuantisedCloud.from_gaussians(gaussians).to_gaussians()
 
 
 def _facts(content: ExportContent, cloud: QuantisedCloud) -> dict[str, Any]:
     """Return what the page knows in addition to the arrays."""
-    cameras = [_camera(view) for view in content.views]
+    up = (0.0, -1.0, 0.0) if content.up is None else content.up.tolist()
+    cameras = [_camera(v.camera, v.name, v.regime) for v in content.views] or [_overview(cloud)]
     return {
         "gaussians": len(cloud.means),
         "degree": cloud.degree,
@@ -160,17 +168,26 @@ def _facts(content: ExportContent, cloud: QuantisedCloud) -> dict[str, Any]:
         "margin": JACOBIAN_MARGIN,
         "offset": content.similarity.offset.tolist(),
         "scale": content.similarity.scale,
-        "up": _up(content),
+        "up": up,
         "comments": list(content.comments),
         "cameras": cameras,
     }
 
 
-def _camera(view: View) -> dict[str, Any]:
-    camera = view.camera
-    lens = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+def _camera(camera: Camera, name: str, regime: str) -> dict[str, Any]:
+    lens = {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
     pose = camera.world_to_camera[:3].tolist()
-    return {"name": view.name, "regime": view.regime, **lens, "world_to_camera": pose}
+    return {"name": name, "regime": regime, **lens, "world_to_camera": pose}
+
+
+def _overview(cloud: QuantisedCloud) -> dict[str, Any]:
+    """Return a camera that sees most Gaussians, for a scene without cameras."""
+    middle = np.median(cloud.means, axis=0)
+    extent = float(np.quantile(np.linalg.norm(cloud.means - middle, axis=1), 0.9)) or 1.0
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, 3] = torch.from_numpy(-middle.astype(np.float64))
+    pose[2, 3] += 3.0 * extent
+    return _camera(Camera(1280, 720, 1000.0, 1000.0, 640.0, 360.0, pose), "overview", "")
 
 
 def _script_json(value: object) -> str:
@@ -198,24 +215,28 @@ def _real(stored: NDArray[np.uint16], between: tuple[float, float]) -> NDArray[n
     return (low + stored.astype(np.float64) / _UNSIGNED * (high - low)).astype(np.float32)
 
 
-def _packed(rest: NDArray[np.float32], degree: int) -> NDArray[np.uint8]:
-    """Return [N, 16 d] bytes of bands 1 to d of `rest` [N, 15, 3]."""
-    number, used = len(rest), 3 * ((degree + 1) ** 2 - 1)
-    values = np.nan_to_num(rest.reshape(number, 3 * REST)[:, :used])
-    # Most Gaussians have the range 1, so that their bytes are small numbers, which compress well.
-    largest = np.maximum(np.abs(values).max(axis=1, initial=0.0, keepdims=True), 1.0)
-    ranges = np.nextafter(largest.astype("<f2"), np.float16(np.inf))
-    ranges = np.where(largest > 1.0, ranges, np.float16(1.0)).astype("<f2")
-    table = np.zeros((number, _TEXEL * degree), dtype=np.uint8)
-    if degree:
-        steps = np.rint(values / ranges.astype(np.float32) * _BYTE).astype(np.int8)
-        table[:, :used] = steps.view(np.uint8)
-        table[:, -2:] = ranges.view(np.uint8)
-    return table
+def _packed(
+    rest: NDArray[np.float32], degree: int
+) -> tuple[NDArray[np.int8], NDArray[np.float16]]:
+    """Return `harmonics` [N, 16 d] and their ranges [N, 1] of bands 1 to d of `rest` [N, 15, 3]."""
+    number, bands = len(rest), (degree + 1) ** 2 - 1
+    values = np.zeros((number, 4 * (degree + degree // _FULL), 3), dtype=np.float32)
+    values[:, :bands] = np.nan_to_num(rest[:, :bands])
+    # The range is 1 unless a coefficient is larger, so that most bytes are small and compress well.
+    largest = np.maximum(np.abs(values).max(axis=(1, 2), initial=0.0), 1.0)
+    ranges = largest.astype("<f2")
+    ranges = np.where(ranges < largest, np.nextafter(ranges, np.float16(np.inf)), ranges)
+    steps = np.rint(values * (_BYTE / ranges.astype(np.float32))[:, None, None])
+    words = steps.astype(np.int8).reshape(number, -1, 4, 3).swapaxes(2, 3).reshape(number, -1)
+    table = np.zeros((number, _TEXEL * degree), dtype=np.int8)
+    table[:, : words.shape[1]] = words
+    return table, ranges[:, None]
 
 
-def _unpacked(table: NDArray[np.uint8], degree: int) -> NDArray[np.float32]:
-    bands = (degree + 1) ** 2 - 1
-    ranges = np.ascontiguousarray(table[:, -2:]).view("<f2").astype(np.float32)
-    steps = np.ascontiguousarray(table[:, : 3 * bands]).view(np.int8).astype(np.float32)
-    return (steps / _BYTE * ranges).reshape(-1, bands, 3)
+def _unpacked(
+    table: NDArray[np.int8], ranges: NDArray[np.uint16], degree: int
+) -> NDArray[np.float32]:
+    words = table[:, : 12 * (degree + degree // _FULL)].reshape(len(table), -1, 3, 4)
+    steps = words.swapaxes(2, 3).reshape(len(table), -1, 3)[:, : (degree + 1) ** 2 - 1]
+    scale = np.ascontiguousarray(ranges).view("<f2").astype(np.float32) / _BYTE
+    return steps.astype(np.float32) * scale[:, :, None]
