@@ -12,8 +12,9 @@ from support.scenes import write_tiny_scene
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.run import app, load_run
+from crossgrad_core.run.export import ExportOptions
 from crossgrad_core.run.postprocess import evaluate, export, render
-from crossgrad_core.run.postprocess.open_options import How
+from crossgrad_core.run.postprocess.open_options import AS_IT_IS, How
 from crossgrad_core.run.results.lock import locked
 from crossgrad_plugins.exporters.ply_file import read_ply
 
@@ -58,8 +59,8 @@ def new_files(folder: Path, before: dict[str, bytes]) -> set[str]:
     return set(now) - set(before)
 
 
-def export_file(folder, **options):
-    export.export(folder, **{"file_format": "ply", "out": None, **options})
+def export_file(folder, out=None, how=AS_IT_IS, **options):
+    export.export(folder, file_format="ply", out=out, options=ExportOptions(**options), how=how)
 
 
 def test_baking_for_a_view_does_not_replace_the_file_of_the_summary(finished, capsys):
