@@ -17,6 +17,8 @@ INITIALIZER_WITHOUT_POINTS: Final = "triangulated"
 RESOLUTION: Final = "full"
 #: The exporter also reads the file of `--init FILE.ply`.
 EXPORTER: Final = "ply"
+#: Exporter of the page that shows a small scene in a browser.
+PAGE_EXPORTER: Final = "html"
 METRICS: Final = "psnr+ssim+ssim-skimage+psnr-track+psnr-cc+lpips"
 #: Densifier for a backbone that names no default.
 DENSIFIER: Final = "adc"

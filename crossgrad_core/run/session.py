@@ -7,11 +7,12 @@ from pathlib import Path
 from time import perf_counter
 
 from crossgrad_core.contract.contexts import EvaluationReport
+from crossgrad_core.defaults import PAGE_EXPORTER
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import evaluate
 from crossgrad_core.evaluation.result import EvaluationResult
 from crossgrad_core.run.checkpoint import Keep, drop_later, latest, renew_scalars, save
-from crossgrad_core.run.export import Exported, described, export_scene, renderer
+from crossgrad_core.run.export import Exported, described, export_scene, renderer, write_page
 from crossgrad_core.run.load_run import to_checkpoint
 from crossgrad_core.run.results.curve import draw_curve
 from crossgrad_core.run.results.kept import KEY as KEPT
@@ -34,6 +35,8 @@ from crossgrad_core.training.state import TrainState
 
 #: Name of the file with the trained scene, for viewers. The exporter adds the suffix.
 CLOUD = "point_cloud"
+#: Name of the page that shows a small scene in a browser.
+PAGE = f"{CLOUD}.{PAGE_EXPORTER}"
 #: Number of held-out views for which panels are rendered.
 PANELS = 4
 
@@ -55,6 +58,7 @@ class Session:
         self._table = table
         self._result: tuple[int, EvaluationResult] | None = None
         self._exported: Exported | None = None
+        self._page: str | None = None
         self._saved_step = -1
         self._evaluated_step = -1
 
@@ -180,6 +184,14 @@ class Session:
         for line in described(self._exported, path):
             setup.hook.crossgrad_log(text=line)
 
+    def write_page(self, setup: Setup, state: TrainState) -> None:
+        """Write a page that shows the exported scene, if it is small; see `export.write_page`."""
+        if self._exported is None or setup.selection.names["exporter"] == PAGE_EXPORTER:
+            return
+        with reporting(state):
+            written = write_page(setup, state, self.folder / PAGE, self._exported.gaussians)
+        self._page = PAGE if written else None
+
     def summarise(
         self, setup: Setup, state: TrainState, status: Status, error: str | None = None
     ) -> None:
@@ -192,6 +204,7 @@ class Session:
             totals=totals(setup, state),
             result=self.result(state.step),
             ply=None if self._exported is None else self._exported.as_data(),
+            page=self._page,
             rows=read_metrics(self.folder),
             seconds=state.clock,
             config=setup.config.model_dump(mode="json"),

@@ -40,6 +40,7 @@ class Summary:
         config: The resolved configuration as plain data, including the seed.
         environment: Machine and versions.
         ply: Description of the PLY; None if none was written.
+        page: Name of the page that shows the scene in a browser; None if none was written.
         notes: Choices and omissions, with their reasons.
         decisions: The table of decided settings.
         check: Results of the consistency check of the scene; None without a check.
@@ -55,6 +56,7 @@ class Summary:
     config: Mapping[str, Any]
     environment: "Mapping[str, Json]"
     ply: "Mapping[str, Json] | None" = None
+    page: str | None = None
     notes: Sequence[str] = ()
     decisions: Sequence[Decision] = ()
     check: "Mapping[str, Json] | None" = None
@@ -119,6 +121,7 @@ def _as_data(summary: Summary) -> dict[str, Any]:
         **_metrics(summary.result),
         "best": best_of(summary.rows),
         "ply": None if summary.ply is None else dict(summary.ply),
+        "page": summary.page,
         "seconds": {
             name: value for name, value in asdict(summary.seconds).items() if name != "cpu"
         },

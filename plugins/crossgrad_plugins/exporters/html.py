@@ -1,4 +1,4 @@
-"""One HTML page that shows the Gaussians in any browser, without a network and without a library."""
+"""One HTML page that shows the Gaussians in any browser, without a network or a library."""
 
 import json
 import zlib
@@ -17,8 +17,8 @@ from typing_extensions import override
 from crossgrad_core.numerics.raster_constants import ALPHA_THRESHOLD, JACOBIAN_MARGIN
 from crossgrad_core.plugin import (
     Camera,
-    Exporter,
     ExportContent,
+    Exporter,
     Gaussians,
     Response,
     Similarity,
@@ -32,9 +32,12 @@ NEAR, DILATION, MAX_ALPHA = 1e-3, 0.3, 0.99
 #: The page holds all data in one text, and browsers limit a text to 512 MiB.
 MOST_GAUSSIANS: Final = 4_000_000
 _UNSIGNED, _SIGNED, _BYTE = 2**16 - 1, 2**15 - 1, 2**7 - 1
+_LARGEST_HALF = float(np.finfo(np.float16).max)
 #: Bytes of a texel of the texture with spherical harmonics; each degree needs one texel more.
 #: Degrees 1, 2 and 3 have 3, 8 and 15 coefficients per channel, in 1, 2 and 4 groups of four.
 _TEXEL, _FULL = 16, 3
+#: Bytes of a Gaussian of degree 3 in the page: 84 bytes in base 64, without compression.
+LARGEST_BYTES: Final = 112
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +57,7 @@ class QuantisedCloud:
         scale_range: Smallest and largest logarithm.
         color_range: Smallest and largest coefficient of band 0.
         antialiased: True for the response `antialiased`, False for `plain`.
-        dilation: Dilation in px^2.
+        dilation: Dilation in px^2; None for the default.
     """
 
     means: NDArray[np.float32]
@@ -66,7 +69,7 @@ class QuantisedCloud:
     scale_range: tuple[float, float]
     color_range: tuple[float, float]
     antialiased: bool
-    dilation: float
+    dilation: float | None
 
     @classmethod
     def from_gaussians(cls, gaussians: Gaussians) -> "QuantisedCloud":
@@ -89,7 +92,7 @@ class QuantisedCloud:
             scale_range=scale_range,
             color_range=color_range,
             antialiased=gaussians.response == "antialiased",
-            dilation=DILATION if gaussians.dilation is None else gaussians.dilation,
+            dilation=gaussians.dilation,
         )
 
     def to_gaussians(self) -> Gaussians:
@@ -111,8 +114,9 @@ class QuantisedCloud:
     def packed(self) -> bytes:
         """Return one zlib stream of all arrays, in the order in which the page reads them."""
         arrays = (self.means, self.harmonics, self.scales, self.quats, self.colors)
-        # A higher level needs several times the time for 2 % fewer bytes.
-        return zlib.compress(b"".join(array.tobytes() for array in arrays), 1)
+        # These bytes hardly repeat, so a search for repetitions only doubles the time.
+        packer = zlib.compressobj(strategy=zlib.Z_HUFFMAN_ONLY)
+        return b"".join([*(packer.compress(array.tobytes()) for array in arrays), packer.flush()])
 
 
 class Html(Exporter):
@@ -121,6 +125,11 @@ class Html(Exporter):
     suffix: ClassVar[str] = "html"
     lossy: ClassVar[bool] = True
     responses: ClassVar[frozenset[Response]] = frozenset({"plain", "antialiased"})
+    keeps_response: ClassVar[bool] = True
+
+    @override
+    def largest_size(self, gaussians: int) -> int:
+        return len(_template()) + gaussians * LARGEST_BYTES
 
     @override
     def write(self, content: ExportContent, path: Path) -> tuple[str, ...]:
@@ -134,16 +143,12 @@ class Html(Exporter):
                 todo="export fewer Gaussians, or choose another --format",
             )
         cloud = QuantisedCloud.from_gaussians(content.gaussians)
-        page = files(__package__).joinpath("viewer.html").read_text(encoding="utf-8")
-        title, scene, data = "@TITLE@", "@SCENE@", "@DATA@"
-        head, _, rest = page.partition(title)
-        middle, _, rest = rest.partition(scene)
-        before, _, after = rest.partition(data)
-        parts = (head, escape(content.name), middle, _script_json(_facts(content, cloud)), before)
+        head, _, rest = _template().partition(b"@TITLE@")
+        middle, _, rest = rest.partition(b"@SCENE@")
+        before, _, after = rest.partition(b"@DATA@")
+        title, facts = escape(content.name).encode(), _script_json(_facts(content, cloud))
         with atomic_file(path) as file:
-            file.write("".join(parts).encode())
-            file.write(b64encode(cloud.packed()))
-            file.write(after.encode())
+            file.writelines((head, title, middle, facts, before, b64encode(cloud.packed()), after))
         return ()
 
     @override
@@ -161,7 +166,7 @@ def _facts(content: ExportContent, cloud: QuantisedCloud) -> dict[str, Any]:
         "scale_range": cloud.scale_range,
         "color_range": cloud.color_range,
         "antialiased": cloud.antialiased,
-        "dilation": cloud.dilation,
+        "dilation": DILATION if cloud.dilation is None else cloud.dilation,
         "near": NEAR,
         "max_alpha": MAX_ALPHA,
         "threshold": ALPHA_THRESHOLD,
@@ -190,9 +195,13 @@ def _overview(cloud: QuantisedCloud) -> dict[str, Any]:
     return _camera(Camera(1280, 720, 1000.0, 1000.0, 640.0, 360.0, pose), "overview", "")
 
 
-def _script_json(value: object) -> str:
+def _template() -> bytes:
+    return files(__package__).joinpath("viewer.html").read_bytes()
+
+
+def _script_json(value: object) -> bytes:
     """Return JSON for a script element: no text inside can end the element or open a comment."""
-    return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")
+    return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c").encode()
 
 
 def _range(values: NDArray[np.float32]) -> tuple[float, float]:
@@ -201,7 +210,7 @@ def _range(values: NDArray[np.float32]) -> tuple[float, float]:
 
 
 def _rounded(values: NDArray[Any]) -> NDArray[Any]:
-    return np.rint(np.nan_to_num(values, nan=0.0))
+    return np.asarray(np.rint(np.nan_to_num(values)))
 
 
 def _unsigned(values: NDArray[Any], between: tuple[float, float]) -> NDArray[np.uint16]:
@@ -215,13 +224,11 @@ def _real(stored: NDArray[np.uint16], between: tuple[float, float]) -> NDArray[n
     return (low + stored.astype(np.float64) / _UNSIGNED * (high - low)).astype(np.float32)
 
 
-def _packed(
-    rest: NDArray[np.float32], degree: int
-) -> tuple[NDArray[np.int8], NDArray[np.float16]]:
+def _packed(rest: NDArray[np.float32], degree: int) -> tuple[NDArray[np.int8], NDArray[np.float16]]:
     """Return `harmonics` [N, 16 d] and their ranges [N, 1] of bands 1 to d of `rest` [N, 15, 3]."""
     number, bands = len(rest), (degree + 1) ** 2 - 1
     values = np.zeros((number, 4 * (degree + degree // _FULL), 3), dtype=np.float32)
-    values[:, :bands] = np.nan_to_num(rest[:, :bands])
+    values[:, :bands] = np.clip(np.nan_to_num(rest[:, :bands]), -_LARGEST_HALF, _LARGEST_HALF)
     # The range is 1 unless a coefficient is larger, so that most bytes are small and compress well.
     largest = np.maximum(np.abs(values).max(axis=(1, 2), initial=0.0), 1.0)
     ranges = largest.astype("<f2")
@@ -238,5 +245,5 @@ def _unpacked(
 ) -> NDArray[np.float32]:
     words = table[:, : 12 * (degree + degree // _FULL)].reshape(len(table), -1, 3, 4)
     steps = words.swapaxes(2, 3).reshape(len(table), -1, 3)[:, : (degree + 1) ** 2 - 1]
-    scale = np.ascontiguousarray(ranges).view("<f2").astype(np.float32) / _BYTE
-    return steps.astype(np.float32) * scale[:, :, None]
+    units = np.ascontiguousarray(ranges).view("<f2").astype(np.float32)[:, :, None] / _BYTE
+    return np.asarray(steps * units, dtype=np.float32)
