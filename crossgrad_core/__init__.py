@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 __version__ = VERSION
 
-#: Name -> module that it comes from.
+#: Public name -> module that defines the name.
 _HOMES = {
     "Camera": "crossgrad_core.contract.scene",
     "Run": "crossgrad_core.run.trained",
@@ -33,7 +33,7 @@ __all__ = ["Camera", "Run", "RunFailedError", "UserError", "__version__", "open"
 def __getattr__(name: str) -> object:
     if name == "run" or name in _HOMES:
         let_idle_threads_sleep()
-    if name == "run":  # Return the sub-package of this name. It can be called like a function.
+    if name == "run":  # Return the sub-package `run`, which can be called like a function.
         return import_module("crossgrad_core.run")
     if name in _HOMES:
         return getattr(import_module(_HOMES[name]), name)

@@ -1,10 +1,11 @@
-"""The public module for commands: everything that a command of a plugin package imports.
+"""The public API for commands of plugin packages: everything that a command imports.
 
-Importing this module is quick. Slow modules (torch, numba) are imported when a function below is
-called or a class below is accessed, so that a command reports within two seconds that it has
-started. Import this module at the top, call `announce()` first, and import `crossgrad_core.plugin`
-(the types of scenes, models and components) in the modules that do the work. The names listed here
-keep their meaning within a minor version (see docs/plugins.md).
+The import of this module takes little time. Slow modules (torch, numba) are imported at the first
+access to a name that needs them. A command can therefore report within two seconds that it has
+started. Import this module at the top of a command's module, and call `announce()` first. Import
+`crossgrad_core.plugin` (the types of scenes, models and components) only in modules that the
+command imports later. The names in `__all__` keep their meaning within a minor version (see
+docs/plugins.md).
 """
 
 from collections.abc import Mapping
@@ -189,8 +190,8 @@ __all__ = [
 
 #: Exit code of a command whose training failed.
 FAILED: Final = 1
-#: Name that is imported on first access -> its module. If the name in the module is different, this
-#: name follows.
+#: Name that is imported at its first access -> its module. If the name in the module differs, the
+#: value is `module:name`.
 _LATE: Final = {
     "ComponentChoice": "config",
     "DEFAULT_STEPS": "run.decisions",
@@ -222,7 +223,7 @@ _LATE: Final = {
 
 
 def __getattr__(name: str) -> object:
-    """Return the class or function of this name; its module is imported first."""
+    """Return the class or function `name`; its module is imported first."""
     if name not in _LATE:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module, _, there = _LATE[name].partition(":")
@@ -233,7 +234,7 @@ def names(slot: str) -> list[str]:
     """Return the sorted names of all installed plugins of a slot such as `operators`.
 
     Raises:
-        KeyError: There is no such slot.
+        KeyError: The slot does not exist.
     """
     return list(entries(slot))
 
@@ -250,7 +251,7 @@ def write_settings(path: Path, settings: Mapping[str, Any]) -> None:
 
 
 def write_mapping(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a mapping as a YAML file, which `read_settings` reads back.
+    """Write a mapping as a YAML file that `read_settings` can read.
 
     Raises:
         UserError: The disk is full, or the folder is read-only.
@@ -261,10 +262,11 @@ def write_mapping(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def configured(settings: Mapping[str, Any]) -> "RunConfig":
-    """Return the configuration that `crossgrad run` would use, with the scene filled in.
+    """Return the configuration that `crossgrad run` would use, including the default scene.
 
     Args:
-        settings: As in a configuration file, with components in their long form: `{"name": ...}`.
+        settings: Settings as in a configuration file. A component is a mapping such as `{"name":
+            "cagrad"}`.
 
     Raises:
         UserError: A setting does not exist or has a wrong value.
@@ -314,8 +316,8 @@ def read_scene(config: "RunConfig") -> "tuple[Scene, str]":
     This function sets the number of CPU threads first.
 
     Raises:
-        UserError: No reader accepts the folder, the reader cannot read it, or the scene contradicts
-            itself.
+        UserError: No reader accepts the folder, the reader fails, or points, poses and photos do
+            not match.
     """
     from crossgrad_core.numerics.threads import configure_threads
     from crossgrad_core.run import assemble as assembling
@@ -354,7 +356,7 @@ def resolved(setup: "Setup") -> dict[str, Any]:
 
 
 def available_cores() -> tuple[int, ...]:
-    """Return the number of cores that this process may use, limited by its container's quota."""
+    """Return the cores that this process may use; a container's CPU quota limits their number."""
     import os
 
     from crossgrad_core.system import cores
@@ -365,7 +367,7 @@ def available_cores() -> tuple[int, ...]:
 
 
 def available_memory() -> int | None:
-    """Return the bytes of memory that are still available; None if the system reports none."""
+    """Return the number of bytes of available memory; None if the system does not report it."""
     import torch
 
     from crossgrad_core.training.memory import available_bytes
@@ -389,7 +391,10 @@ def summary_of(folder: Path) -> dict[str, Any] | None:
 
 
 def with_steps(setup: "Setup", steps: int) -> "Setup":
-    """Return the setup with a schedule of `steps` steps that no component has changed."""
+    """Return the setup with the standard schedule of a run of `steps` steps.
+
+    The densifier does not change the times of this schedule.
+    """
     from crossgrad_core.contract.schedule import Schedule
 
     counting = setup.schedule.counting
@@ -397,7 +402,7 @@ def with_steps(setup: "Setup", steps: int) -> "Setup":
 
 
 def affordable_steps(setup: "Setup", seconds: float) -> int:
-    """Return how many steps fit into `seconds` of training.
+    """Return the number of steps that fit into `seconds` of training.
 
     The kernels are compiled first. The compilation time is not part of `seconds`.
 
@@ -416,13 +421,13 @@ def affordable_steps(setup: "Setup", seconds: float) -> int:
 
 
 def take_steps(setup: "Setup", state: "TrainState") -> None:
-    """Train to the end of the schedule without a folder: nothing is evaluated or saved.
+    """Train to the end of the schedule without evaluating or saving anything.
 
     `state` is updated in place. To observe the training, register a plugin first:
     `setup.manager.register(plugin, name=...)`.
 
     Raises:
-        TrainingFailedError: Training failed; `state` is the last good state.
+        TrainingFailedError: Training failed; `state` is the last valid state.
     """
     from crossgrad_core.training.loop import Stopper, train
 
@@ -430,7 +435,7 @@ def take_steps(setup: "Setup", state: "TrainState") -> None:
 
 
 class _NoFolder:
-    """A stand-in for a run's folder that discards all results."""
+    """A replacement for the writer of a run's folder; it discards all results."""
 
     def evaluate(self, setup: "Setup", state: "TrainState") -> None:
         pass

@@ -1,4 +1,4 @@
-"""The configuration of a run: one schema for command line, file and results."""
+"""The configuration of a run: the class `RunConfig` for command line, files and results."""
 
 from collections.abc import Container, Mapping
 from pathlib import Path
@@ -21,10 +21,10 @@ from crossgrad_core.contract.schedule import ScheduleMode, Unit, ViewsPerStepSpe
 
 #: Value of a setting that the run chooses at its start.
 AUTO: Final = "auto"
-#: Settings of a run that do not change its training.
+#: Settings that may change when a run is resumed, because they do not affect the training.
 CHANGEABLE: Final = frozenset({"device", "threads", "stop_after"})
-#: How the number of primitives grows: as the densifier requests, or by a budget for the length of
-#: the run.
+#: Rule for the growth of the number of primitives: as the densifier requests, or by a budget that
+#: depends on the length of the run.
 Growth: TypeAlias = Literal["unbounded", "budget"]
 
 
@@ -33,7 +33,7 @@ _RENAMED: Final = {"views": "views_per_step"}
 
 
 def current_name(setting: str, beside: Container[str] = ()) -> str:
-    """Return the present name of a setting; keep the old name if `beside` has the present name."""
+    """Return the present name of a setting; keep an old name if `beside` contains the new name."""
     new = _RENAMED.get(setting, setting)
     return setting if new in beside else new
 
@@ -61,7 +61,7 @@ class ComponentChoice(BaseModel):
 class RunConfig(BaseModel):
     """All settings that determine a run.
 
-    `None` leaves a setting to the recipe; the recipe's decision is written to config.yaml.
+    The recipe decides settings that are None, and the decisions are written to config.yaml.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -100,7 +100,7 @@ class RunConfig(BaseModel):
     )
     rasterizer: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
         ComponentChoice(name=AUTO),
-        description="Renders the views. Default: auto, the fastest one for the device.",
+        description="Renders the views. Default: auto, the fastest rasterizer for the device.",
     )
     loss: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
         ComponentChoice(name=defaults.LOSS),
@@ -142,13 +142,14 @@ class RunConfig(BaseModel):
 
     views_per_step: Annotated[int | str | None, Flag("K", TRAINING, "views")] = Field(
         None,
-        description="Number of views per step, K; 1..2@0.5 changes it after half of the steps. "
+        description="Number of views per step, K; 1..2@0.5 changes K from 1 to 2 after half of "
+        "the steps. "
         "Default: auto.",
     )
     steps: Annotated[int | None, Flag("N", TRAINING, common=True)] = Field(
         None,
         ge=1,
-        description="Number of optimizer steps; schedules scale with it. Default: 30000.",
+        description="Number of optimizer steps; schedules scale with this number. Default: 30000.",
     )
     max_views: Annotated[int | None, Flag("N", TRAINING)] = Field(
         None,
@@ -157,7 +158,7 @@ class RunConfig(BaseModel):
         "limit that it reaches first.",
     )
     seconds: Annotated[float | None, Flag("S", TRAINING, common=True)] = Field(
-        None, gt=0, description="Training time in seconds; it determines the number of steps."
+        None, gt=0, description="Training time in seconds, which determines the number of steps."
     )
     clock: Annotated[Literal["wall", "cpu"], Flag("wall|cpu", TRAINING)] = Field(
         "wall",
@@ -166,16 +167,17 @@ class RunConfig(BaseModel):
     )
     revisions: tuple[tuple[PositiveInt, PositiveInt], ...] = Field(
         (),
-        description="(step, planned number of steps from that step on) of a run with a time budget",
+        description="pairs (step, number of steps planned after this step) of a run with a time "
+        "budget",
     )
     revised: tuple[dict[str, int | float | str], ...] = Field(
-        (), description="settings that changed with each of these plans"
+        (), description="settings that changed with each entry of revisions"
     )
     planned_seconds: float | None = Field(
-        None, gt=0, description="seconds of a run with a time budget"
+        None, gt=0, description="training seconds of a run with a time budget"
     )
     planned_views: int | None = Field(
-        None, ge=1, description="maximum number of views within these seconds"
+        None, ge=1, description="maximum number of views of a run with a time budget"
     )
     seed: Annotated[int, Flag("N", TRAINING, common=True)] = Field(
         0, ge=0, description="Seed of all random numbers. Default: 0."
@@ -208,7 +210,7 @@ class RunConfig(BaseModel):
         None,
         ge=0,
         description="minimum number of edits; short runs start earlier and edit more often to "
-        "reach it",
+        "reach this number",
     )
     reset_every: int | None = Field(
         None,
@@ -229,7 +231,8 @@ class RunConfig(BaseModel):
         Field(
             "all",
             description="Views whose statistics density control uses: all views of a step, only "
-            "one of them, or all plus one extra view that is not trained on. Default: all.",
+            "one of these views, or all views and one extra view that is not trained on. Default: "
+            "all.",
         )
     )
     rate_factor: Annotated[float | None, Flag("F", TRAINING)] = Field(
@@ -242,11 +245,11 @@ class RunConfig(BaseModel):
         None,
         ge=0.9,
         lt=1,
-        description="decay of Adam's second moment; if it is set, the learning rates for many "
-        "passes over the photos are used",
+        description="decay of Adam's second moment; setting beta2 selects the learning rates for "
+        "many passes over the photos",
     )
     few_pass_rates: bool | None = Field(
-        None, description="blocks that use the learning rates for few passes over the photos"
+        None, description="true: use the learning rates for few passes over the photos"
     )
     step_order: Literal["optimize-first", "densify-first"] | None = Field(
         None,
@@ -292,8 +295,8 @@ class RunConfig(BaseModel):
     )
     device: Annotated[str, Flag("auto|cpu|cuda|cuda:N", MACHINE, common=True)] = Field(
         AUTO,
-        description="Device of the tensors; auto: a GPU if a rasterizer works on it, else the "
-        "CPU. Default: auto.",
+        description="Device of the tensors; auto: a GPU if a rasterizer works on the GPU, else "
+        "the CPU. Default: auto.",
     )
     threads: Annotated[int | None, Flag("N", MACHINE)] = Field(
         None, ge=1, description="Number of CPU threads. Default: all."
@@ -331,7 +334,8 @@ class RunConfig(BaseModel):
     max_nonfinite_blocks: int = Field(
         100,
         ge=1,
-        description="stop the run after this many blocks were dropped because they were not finite",
+        description="stop the run after this number of blocks were dropped because their "
+        "gradients were not finite",
     )
 
     @model_validator(mode="before")
@@ -361,7 +365,7 @@ class RunConfig(BaseModel):
     @field_validator("decided")
     @classmethod
     def _are_settings(cls, value: dict[str, str]) -> dict[str, str]:
-        """Refuse a reason for something that is not a setting."""
+        """Refuse names in `decided` that are not settings."""
         for name in value:
             setting, _, option = name.partition(".")
             options = SceneOptions.model_fields if setting == "data" else {option}
@@ -400,7 +404,7 @@ class RunConfig(BaseModel):
 
     @property
     def view_plan(self) -> ViewsPerStepSpec | None:
-        """The number of views of every step; None if the sampler decides it."""
+        """The number of views of every step; None if the sampler decides the number."""
         return (
             None
             if self.views_per_step is None

@@ -1,6 +1,6 @@
-"""The plugins that the core names: the defaults of a run, and examples in help texts and messages.
+"""Names of plugins in the core: the defaults of a run, and examples in help texts and messages.
 
-No other file of the core names a plugin.
+No other file of the core contains names of plugins.
 """
 
 from typing import Final
@@ -12,7 +12,8 @@ OPERATOR: Final = "sum"
 LOSS: Final = "l1-ssim"
 #: Initializer that adds no points, for published runs and for runs whose points come from a file.
 PLAIN_INITIALIZER: Final = "points"
-#: Initializer that finds points for a scene without points. Messages contain its name.
+#: Initializer that finds points for a scene without points. Messages to users contain the name of
+#: this initializer.
 INITIALIZER_WITHOUT_POINTS: Final = "triangulated"
 RESOLUTION: Final = "full"
 #: The exporter also reads the file of `--init FILE.ply`.
@@ -20,7 +21,7 @@ EXPORTER: Final = "ply"
 #: Exporter of the page that shows a small scene in a browser.
 PAGE_EXPORTER: Final = "html"
 METRICS: Final = "psnr+ssim+ssim-skimage+psnr-track+psnr-cc+lpips"
-#: Densifier for a backbone that names no default.
+#: Densifier of backbones that define no default densifier.
 DENSIFIER: Final = "adc"
 #: If no reader accepts a folder, the error message of this reader explains what is missing.
 READER: Final = "colmap"
@@ -35,7 +36,7 @@ PLANNER: Final = "scene"
 #: Observer of every run.
 PROGRESS: Final = "progress"
 
-#: The rasterizer of contract checks, and the densifier that makes no edits.
+#: The rasterizer that checks of plugins use, and the densifier that makes no edits.
 REFERENCE_RASTERIZER: Final = "torch"
 NO_DENSIFIER: Final = "none"
 

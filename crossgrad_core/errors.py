@@ -5,18 +5,18 @@ from typing import Final
 
 from crossgrad_core.wording import one_line, showable
 
-#: Maximum number of characters in one part of a message, and in its part `where`. A longer text
-#: loses its middle.
+#: Maximum number of characters in one part of a message, and in the part `where`. In a longer text,
+#: the middle is left out.
 LONGEST: Final = 500
 LONGEST_PLACE: Final = 1000
 
 
 class UserError(Exception):
-    """Bad input from the user, reported as one message with exit code 2, never as a traceback.
+    """Bad input from the user, which a command reports as one message with exit code 2.
 
     Args:
         what: The problem, as a sentence without a full stop.
-        where: The file, option or plugin concerned.
+        where: The file, option or plugin that the problem concerns.
         expected: The value that would have been correct.
         found: The value that was found instead.
         todo: The next step for the user.
@@ -53,13 +53,13 @@ def _short(content: str, longest: int = LONGEST) -> str:
 
 
 class IncompatibleSelectionError(UserError):
-    """The selected components cannot work together; raised before training, with the reasons."""
+    """The selected components cannot work together; the error lists the reasons before training."""
 
 
 class RunFailedError(Exception):
     """Training failed; the functions `crossgrad_core.run` and `resume` raise this error.
 
-    Existing results are kept.
+    Results that the run wrote before are kept.
 
     Args:
         folder: The run's folder, with the results so far, log.txt, and checkpoints to continue

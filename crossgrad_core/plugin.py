@@ -1,4 +1,4 @@
-"""The public API for plugin authors: everything that a plugin needs, in one module.
+"""The public API for plugin authors, which contains everything that a plugin needs.
 
 The names in `__all__` keep their meaning within a minor version (see docs/plugins.md).
 """

@@ -1,11 +1,11 @@
-"""Small pieces of error messages. This module imports nothing heavy."""
+"""Functions that make parts of error messages. This module imports no large package."""
 
 import re
 from collections.abc import Iterable
 
-# Control characters could move the cursor or recolour the terminal. Characters of bidirectional
-# text reorder a line. Lone surrogates represent bytes that are not UTF-8, and they cannot be
-# written to a file.
+# Control characters could move the cursor or change the colours of the terminal. Characters for
+# bidirectional text could reorder a line. Single surrogates represent bytes that are not UTF-8 and
+# cannot be written to a file.
 _UNSHOWABLE = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
@@ -15,7 +15,7 @@ def showable(text: str) -> str:
 
 
 def one_line(text: object) -> str:
-    """Return text as one line, for names and paths: line feeds are escaped."""
+    """Return text as one line with escaped line feeds, for names and paths."""
     return showable(str(text)).replace("\n", "\\n")
 
 
@@ -30,7 +30,7 @@ def with_article(noun: str) -> str:
 
 
 def plural(word: str) -> str:
-    """Return the slot for the word of one member, the inverse of `singular`."""
+    """Return the name of the slot for a singular word: `operator` -> `operators`."""
     return f"{word}es" if word.endswith("ss") else f"{word}s"
 
 
@@ -53,7 +53,7 @@ def did_you_mean(name: str, choices: Iterable[str]) -> str:
 
 
 def sentences(*parts: str) -> str:
-    """Return the non-empty parts, joined by semicolons."""
+    """Return the parts that are not empty, joined by semicolons."""
     return "; ".join(part for part in parts if part)
 
 

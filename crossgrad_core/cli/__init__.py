@@ -1,1 +1,1 @@
-"""The command line. The modules of the command line import nothing heavy until a command runs."""
+"""The command line. These modules import no large package until a command runs."""

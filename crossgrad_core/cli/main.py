@@ -31,15 +31,15 @@ INTERRUPTED = 130
 
 
 class WithPlugins(TyperGroup):
-    """The core's commands, followed by the commands of installed plugins.
+    """A group of the core's commands and of the commands of installed plugins.
 
-    Plugin packages are searched only if the core does not have the command. A plugin cannot replace
-    a command of the core.
+    The group searches the plugin packages only if the core does not contain the command. A plugin
+    cannot replace a command of the core.
     """
 
     @override
     def get_command(self, ctx: "Context", cmd_name: str) -> "Command | None":
-        """Return the command of that name."""
+        """Return the command `cmd_name` of the core or of a plugin; None if it is unknown."""
         if cmd_name not in self.commands:
             self._add_plugins()
         return super().get_command(ctx, cmd_name)
@@ -52,7 +52,7 @@ class WithPlugins(TyperGroup):
 
     @override
     def invoke(self, ctx: "Context") -> object:
-        """Run a command; an interrupt ends it with the exit status that shells expect."""
+        """Run a command; after Ctrl+C, exit with status 130, as shells expect."""
         try:
             return super().invoke(ctx)
         except typer.BadParameter as error:
@@ -68,7 +68,7 @@ class WithPlugins(TyperGroup):
 
 
 def _plain(error: typer.BadParameter) -> str:
-    """Return the message about a wrong value, without pydantic's wording; the value is included."""
+    """Return the message about a wrong option value, without pydantic's phrases."""
     from pydantic import ValidationError
 
     message = error.message.removeprefix("Value error, ").replace("Input should be", "must be")
@@ -81,7 +81,7 @@ def _plain(error: typer.BadParameter) -> str:
 
 
 class PluginCommand(TyperCommand):
-    """A placeholder for a plugin command; the command is imported when it is called."""
+    """A placeholder that imports a plugin's command only when a user calls the command."""
 
     def __init__(self, entry: registry.Entry) -> None:
         super().__init__(entry.name, callback=None, short_help=summary(entry))
@@ -93,7 +93,8 @@ class PluginCommand(TyperCommand):
         """Import the plugin's command and return the context of the command.
 
         Raises:
-            UserError: Several packages offer the name, or the command cannot be imported.
+            UserError: Several packages define a command of this name, or the command cannot be
+                imported.
         """
         command = load_command(registry.find(COMMANDS, str(self.name)))
         member = as_group_member(command, str(self.name))
@@ -131,7 +132,7 @@ def crossgrad(
         ),
     ] = False,
 ) -> None:
-    """Train 3D Gaussian Splatting from hybrid captures, with exchangeable parts."""
+    """Train 3D Gaussian Splatting from hybrid captures, with exchangeable components."""
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())
 
@@ -148,8 +149,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Args:
         arguments: The words after `crossgrad`; `sys.argv[1:]` by default.
     """
-    # The command line calls this function without arguments. In this case, the process belongs to
-    # the command.
+    # The program `crossgrad` calls this function without arguments. A Python caller passes
+    # arguments, and its standard streams must not change.
     if arguments is None:
         outlast_readers()
     try:
@@ -159,7 +160,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         user_error = error if isinstance(error, UserError) else failed_plugin(error)
         if user_error is None and isinstance(error, OSError) and is_too_long(error):
             user_error = path_too_long(error.filename)
-        if user_error is None:  # An error that is a bug of crossgrad keeps its traceback.
+        if user_error is None:  # This error is a bug of crossgrad, so show its traceback.
             raise
         finish()
         print(f"error: {user_error}", file=sys.stderr)  # noqa: T201

@@ -1,4 +1,7 @@
-"""`crossgrad run`: train, evaluate, export. The options are generated from the schema of a run."""
+"""`crossgrad run`: train, evaluate, export.
+
+The options are generated from the fields of the settings classes.
+"""
 
 from collections.abc import Callable, Iterator, Mapping
 from inspect import Parameter, Signature
@@ -16,7 +19,7 @@ from crossgrad_core.system.command_options import print_all_options
 from crossgrad_core.system.startup import announce
 from crossgrad_core.wording import listed
 
-#: Options that apply only to this start of the command.
+#: Options that apply to one call of `crossgrad run` only. A resumed run may get other values.
 _OF_THE_COMMAND: Final = frozenset(
     {"resume", "accept_scene", "accept_plugins", "check", "quiet", "verbose"}
 )
@@ -27,7 +30,8 @@ def refuse_beside_resume(run: Path, given: Mapping[str, object]) -> None:
 
     Args:
         run: The folder of the run to resume.
-        given: Option name -> value; None, False and empty lists if the user did not give it.
+        given: Option name -> value. None, False or an empty list means that the user did not give
+            the option.
 
     Raises:
         UserError: The resumed run would ignore an option; the message names the option as the user
@@ -39,7 +43,7 @@ def refuse_beside_resume(run: Path, given: Mapping[str, object]) -> None:
             "settings and the scene cannot be changed when a run is resumed",
             where=listed(typed),
             expected="--device, --threads, --stop-after, --accept-scene, --accept-plugins, "
-            "--check, -q and -vonly",
+            "--check, -q and -v only",
             todo=f"leave {'it' if len(typed) == 1 else 'them'} out to continue {run}, or leave "
             "--resume out to start a new run",
         )
@@ -80,8 +84,8 @@ def _own(
     return _parameter(name, kind, info, default=False if kind is bool else None)
 
 
-#: Options that are not settings. The help shows them before the settings, after the first setting
-#: that concerns results, or last.
+#: Options that are not settings. In the help, these options are before the settings, after the
+#: first setting about results, or at the end.
 _FRONT: Final = (
     _own(
         "config",
@@ -131,15 +135,15 @@ _LAST: Final = (
         bool,
         "--prepare",
         heading=SCENE,
-        help="SCENE is a folder of photos without poses: first estimate the poses, as "
-        "`crossgrad prepare` does, into SCENE-scene.",
+        help="SCENE is a folder of photos without poses. First estimate the poses, as `crossgrad "
+        "prepare` does, and write the scene to the folder SCENE-scene.",
     ),
     _own(
         "dry_run",
         bool,
         "--dry-run",
-        help="Check everything and print the resolved settings without training. With "
-        "--prepare, the photos are prepared.",
+        help="Check everything and print the resolved settings without training. With --prepare, "
+        "the poses are still estimated.",
     ),
     _own(
         "check",
@@ -181,7 +185,7 @@ def _parameters() -> Iterator[Parameter]:
 
 
 def _setting(option: Option) -> Parameter:
-    """Return the parameter of a setting; it is None if the user does not give the setting."""
+    """Return the parameter of a setting; its value is None if the user gives no value."""
     flag = option.flag
     info = (
         typer.Option(
@@ -209,7 +213,7 @@ def _with_options(function: Callable[..., None]) -> Callable[..., None]:
 def run(**given: Any) -> None:  # noqa: ANN401 - typed by the schema
     """Train on a scene, evaluate, and write the results to a folder.
 
-    Every setting has a default. The run writes its decisions to config.yaml in its folder. The
+    Every setting has a default. The run writes all settings to config.yaml in its folder. The
     command `crossgrad run --config config.yaml` repeats the run.
     """
     announce(quiet=given["quiet"])

@@ -1,4 +1,4 @@
-"""Standard streams that never end a command, for closed pipes and limited encodings."""
+"""Standard streams whose failed writes do not end a command."""
 
 import io
 import os
@@ -16,11 +16,11 @@ _HIGHEST: Final = 2  # stderr
 
 
 def outlast_readers() -> None:
-    """Make stdout and stderr ignore failed writes and escape characters that they cannot show.
+    """Make stdout and stderr ignore failed writes and escape characters that cannot be shown.
 
     Otherwise a closed pipe (`| head`), a lost terminal or a full disk would end hours of training
     at the next progress line. A folder name with characters outside the terminal's encoding would
-    do the same. The messages of a run are also in its log.txt.
+    also end the training. The messages of a run are also in its log.txt.
     """
     _occupy()
     sys.stdout = _lasting(sys.stdout)
@@ -46,7 +46,8 @@ class _LastingFile(io.FileIO):
 def _occupy() -> None:
     """Open the null device for each standard stream that the caller closed (`2>&-`).
 
-    Otherwise the next opened file would get the stream's number, and with it the stream's output.
+    Otherwise the next opened file would get the stream's file descriptor. Messages of the program
+    would then be written into this file.
     """
     while (number := os.open(os.devnull, os.O_RDWR)) <= _HIGHEST:
         pass
@@ -56,7 +57,7 @@ def _occupy() -> None:
 def _lasting(stream: TextIO | None) -> TextIO:
     """Return a stream that writes to the same file and ignores failed writes.
 
-    Streams of other kinds (a Windows console) are returned unchanged.
+    Other kinds of streams, such as a Windows console, are returned unchanged.
     """
     if stream is None:
         return open(os.devnull, "w", encoding="utf-8")

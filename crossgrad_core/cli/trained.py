@@ -13,7 +13,8 @@ Ply = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
-        help="Evaluate the Gaussians of this PLY file instead, rendered on black as viewers do.",
+        help="Evaluate the Gaussians of this PLY file instead of the run's. The background is "
+        "black, as in viewers.",
     ),
 ]
 On = Annotated[
@@ -185,14 +186,15 @@ def render(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
         Path | None,
         typer.Option(
             metavar="SCENE",
-            help="Render the views of another capture of the place, as `crossgrad eval --on` does.",
+            help="Render the views of another capture of the same place, as `crossgrad eval --on` "
+            "does.",
         ),
     ] = None,
     path: Annotated[
         str | None,
         typer.Option(
             metavar="FILE|zoom",
-            help="Render a video along the cameras of a file, or a zoom from the farthest to "
+            help="Render a video along the camera path in a file, or a zoom from the farthest to "
             "the nearest photos.",
         ),
     ] = None,

@@ -11,22 +11,24 @@ import torch
 from torch import Tensor
 
 BlockKind = Literal["geometry", "appearance", "neutral"]
-#: Tensor name -> leaf tensor. Per-primitive tensors have the primitives as first dimension.
+#: Tensor name -> leaf tensor. The first dimension of a per-primitive tensor is the number of
+#: primitives.
 Parameters: TypeAlias = dict[str, Tensor]
 
 
 @dataclass(frozen=True)
 class LearningRate:
-    """A log-linear learning rate from `initial` to `final` over the schedule; 0 stays 0.
+    """A learning rate that changes log-linearly from `initial` to `final`; an initial 0 stays 0.
 
     Attributes:
         initial: Learning rate at the first step.
         final: Learning rate at the end of the schedule; None means `initial`.
         few_passes: Positive factor for this learning rate in a run with few passes over the photos
-            (docs/schedules.md). The factors for all learning rates of the backbone apply in
-            addition.
+            (docs/schedules.md). Factors that apply to all learning rates of the backbone multiply
+            this learning rate, too.
 
-    Source: 3DGS; lr(t) = exp((1-u) ln a + u ln b), u = clip(t / T, 0, 1).
+    Source: 3DGS; lr(t) = exp((1-u) ln a + u ln b) with u = clip(t / T, 0, 1). Here t is the count
+    of the schedule, T the end of the decay, a `initial` and b `final`.
     """
 
     initial: float
@@ -37,7 +39,7 @@ class LearningRate:
         """Check that the learning rates are valid for a schedule.
 
         Raises:
-            ValueError: A learning rate is negative or not finite, or decays to 0; or `few_passes`
+            ValueError: A learning rate is negative, is not finite or decays to 0, or `few_passes`
                 is not positive.
         """
         rates = [rate for rate in (self.initial, self.final) if rate is not None]
@@ -56,7 +58,7 @@ class LearningRate:
         return self.final is not None and self.initial not in {0.0, self.final}
 
     def at(self, progress: float) -> float:
-        """Return the learning rate after a share `progress` of the schedule, clipped to [0, 1]."""
+        """Return the learning rate after the share `progress` of the decay, clipped to [0, 1]."""
         if self.final is None or not self.decays:
             return self.initial
         u = min(max(progress, 0.0), 1.0)
@@ -72,11 +74,13 @@ class Block:
         tensors: Names of the block's tensors in `Parameters`. A block with one tensor uses the
             tensor's name.
         per_primitive: True if the first dimension of every tensor is the number of primitives.
-        kind: Geometry, appearance or neutral (for granularity `kind` and per-block dispatch).
-        lr: Learning rate of all tensors of the block. 0 freezes the block: its tensors get no
-            gradient, may have any type, and are used in topology edits and checkpoints only.
+        kind: `geometry`, `appearance` or `neutral`. With granularity `kind`, all blocks of one kind
+            share one Gramian. The operator `dispatch` can use another operator for each kind.
+        lr: Learning rate of all tensors of the block. The rate 0 freezes the block: its tensors get
+            no gradient and may have any type. Only topology edits and checkpoints use frozen
+            tensors.
         rests: True if the block's tensors hold details of the colour, such as spherical harmonics
-            of higher degrees, that need not learn in every step.
+            of higher degrees, that need not be updated in every step.
     """
 
     name: str
@@ -118,9 +122,10 @@ def primitives_of(blocks: tuple[Block, ...], parameters: Mapping[str, Tensor]) -
     return 0
 
 
-#: Names of plugin states that the components of slots use.
+#: Names of the plugin states that belong to the components of slots.
 SLOTS: Final = frozenset({"densifier", "operator", "resolution", "sampler"})
-#: Names of plugin states that are reserved for slots and the core. No other plugin may use them.
+#: Names of plugin states that are reserved for slots and the core. No other plugin may use these
+#: names.
 TAKEN: Final = SLOTS | {"budget", "grouping", "photos", "thinned"}
 Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
 
@@ -175,18 +180,18 @@ class PluginState:
 
 def carried(old: Tensor, source: Tensor, fresh: Tensor) -> Tensor:
     """Return the rows of `old` at `source` [M]; rows marked in `fresh` [M] are zero."""
-    # A plugin may store its tensors on another device than the run.
+    # Move the indices, because a plugin may store its tensors on another device than the run.
     source, fresh = source.to(old.device), fresh.to(old.device)
     # `index_select` copies whole rows; indexing with a tensor copies single elements.
     new = old.index_select(0, source)
-    # On a GPU `nonzero` would wait for the number of marked rows.
+    # On a GPU, index with the mask itself, because `nonzero` would wait for the GPU.
     marked = fresh.nonzero()[:, 0] if fresh.is_cpu else fresh
     new[marked] = torch.zeros((), dtype=old.dtype, device=old.device)
     return new
 
 
-#: The empty state of a plugin that has not stored a state yet. It is read-only, because all runs of
-#: a process share it.
+#: The empty state of a plugin that has not stored a state yet. The state is read-only, because all
+#: runs of a process share this object.
 EMPTY_STATE = PluginState(MappingProxyType({}), MappingProxyType({}), MappingProxyType({}))
 
 
@@ -232,7 +237,7 @@ class Edit:
 
     @property
     def keeps_rows(self) -> bool:
-        """True if all primitives stay and no row is fresh."""
+        """True if the edit keeps all primitives in their rows and marks no row as fresh."""
         return self.source is None and self.fresh is None
 
 
@@ -285,7 +290,7 @@ def _no_values(new: object, count: int, width: torch.Size) -> str:
     if new.rows is not None:
         if wrong := _no_list(new.rows, torch.int64):
             return f"rows are {wrong}"
-        # On a GPU this check would wait for the device.
+        # Check on the CPU only, because on a GPU the check would wait for the device.
         if new.rows.is_cpu and ((new.rows < 0) | (new.rows >= count)).any():
             return f"rows contain indices outside 0 to {count - 1}"
         count = len(new.rows)
@@ -354,22 +359,23 @@ def apply_to_moment(edit: Edit, name: str, old: Tensor) -> Tensor:
     return new
 
 
-#: Epsilon that is added to the root of the second moment (3DGS).
+#: Epsilon that Adam adds to the square root of the second moment (value of 3DGS).
 EPS: Final = 1e-15
-#: Decay rates of the first moment and of the second moment (3DGS).
+#: Adam's decay rates of the first moment and of the second moment (values of 3DGS).
 BETAS: Final = (0.9, 0.999)
-#: With more views than this, the batch rule would set the decay of the first moment to 0.
+#: Largest number of views per step for the batch rule (`AdamRule.for_views`). At this number, the
+#: decay rate of the first moment reaches 0.
 MOST_VIEWS: Final = 10
 
 
 @dataclass(frozen=True)
 class AdamState:
-    """Moments and step counts by tensor name; the first gradient of a tensor adds its name.
+    """Adam's moments and step counts by tensor name; tensors without a gradient so far are missing.
 
     Attributes:
         exp_avg: First moments, each shaped like its parameter.
         exp_avg_sq: Second moments, each shaped like its parameter.
-        steps: How many gradients each tensor has received.
+        steps: Number of gradients that each tensor has received.
     """
 
     exp_avg: dict[str, Tensor] = field(default_factory=dict)
@@ -379,11 +385,11 @@ class AdamState:
 
 @dataclass(frozen=True)
 class AdamRule:
-    """The averaging rule of Adam.
+    """The hyperparameters of Adam's moments.
 
     Attributes:
-        betas: Decay of the first and the second moment, each in [0, 1).
-        eps: Added to the root of the second moment.
+        betas: Decay rates of the first and the second moment, each in [0, 1).
+        eps: Number that is added to the square root of the second moment.
         age: Factor that multiplies a tensor's number of steps in the bias correction.
     """
 
@@ -395,17 +401,18 @@ class AdamRule:
     def for_views(
         cls, views: int, age: float = 1.0, betas: tuple[float, float] = BETAS
     ) -> "AdamRule":
-        """Return the batch rule: 1 - beta of both moments is multiplied by the number of views.
+        """Return the rule for K views per step: 1 - beta of both moments is multiplied by K.
 
-        The batch rule also multiplies learning rates by sqrt(K); the caller does this.
+        The caller must also multiply the learning rates by sqrt(K).
 
         Args:
-            views: K, at most `MOST_VIEWS`.
+            views: Number of views per step, K; at most `MOST_VIEWS`.
             age: Number of steps that the run would need if every step had K views, divided by the
-                run's actual number of steps. The quotient differs from 1 only if K changed.
+                run's actual number of steps. The quotient differs from 1 only if K changed during
+                the run.
             betas: Decay factors of the moments for one view per step.
 
-        Source: gsplat; Malladi et al. 2022 (square-root scaling), with K views in place of K
+        Source: gsplat; Malladi et al. 2022 (square-root scaling). Here K counts views instead of
         batches.
         """
         first, second = (max(0.0, 1.0 - views * (1.0 - beta)) for beta in betas)

@@ -1,4 +1,4 @@
-"""Components (frozen pydantic models whose fields are their options) and hook markers."""
+"""The base class of all components, and the decorators that mark hooks."""
 
 from dataclasses import dataclass
 from typing import ClassVar, TypeVar
@@ -20,8 +20,9 @@ hookimpl = pluggy.HookimplMarker(PROJECT)
 class Component(BaseModel):
     """Base class of all components; a component fills a slot.
 
-    The fields are the options (typed, bounded, documented). A component never stores the state of a
-    run; the state is passed in and returned as `PluginState`.
+    The fields of a component are its options. Each option has a type, bounds and a description. A
+    component never stores the state of a run. Its methods receive and return the state as
+    `PluginState`.
 
     Attributes:
         slot: The slot that the component fills; set by the slot's base class.
@@ -48,7 +49,7 @@ def answered(answer: object, kind: type[A], component: Component, method: str) -
 def pair(
     answer: object, first: type[A], second: type[B], component: Component, method: str
 ) -> tuple[A, B]:
-    """Return the two parts of the result of a component's method.
+    """Return the pair that a component's method returned, after a check of both types.
 
     Raises:
         UserError: The result is not a pair of these types. The message names the method.
@@ -63,7 +64,7 @@ def pair(
 def with_state(
     answer: object, kind: type[A], component: Component, method: str
 ) -> tuple[A, PluginState]:
-    """Return a result and the new state, checked as in `pair`."""
+    """Return the result of a component's method and the new state, after a check of both types."""
     return pair(answer, kind, PluginState, component, method)
 
 
@@ -85,8 +86,8 @@ class ViewCounts:
 
     Attributes:
         minimum: Smallest K.
-        maximum: Largest K; None for any.
-        multiple_of: Number of which K must be a multiple.
+        maximum: Largest K; None for no limit.
+        multiple_of: K must be a multiple of this number.
     """
 
     minimum: int = 1

@@ -52,11 +52,13 @@ class RenderedView:
     Attributes:
         view: The view.
         camera: The camera of the render: the view's camera, resized if `scale` is not 1.
-        scale: Side length of the render divided by the side length of the photo as trained.
+        scale: Side length of the render divided by the side length of the photo at training
+            resolution.
         gaussians: The Gaussians that were rendered.
         screen: Screen statistics in pixels of the render, with gradients if a backward pass has
             run. `contract.screen_statistics` converts the statistics to units of the full photo.
-        image: [H, W, 3] the image that is compared with the photo: the render after exposure.
+        image: [H, W, 3] the render after the exposure model; the loss compares this image with the
+            photo.
         photo: [H, W, 3] uint8 photo, in the size of the render.
         mask: [H, W] bool, True where the pixel counts; None if every pixel counts.
     """
@@ -73,12 +75,11 @@ class RenderedView:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ViewRecord(RenderedView):
-    """One rendered view of a step, after its backward pass, detached.
+    """One rendered view of a step after its backward pass; its tensors are detached.
 
     Attributes:
         index: Position in `scene.train_views`.
-        label: Group label of the view, or None.
-        loss: Photometric loss of this view.
+        label: Group label of the view; None without groups. loss: Photometric loss of this view.
         background: [3] RGB background of the render.
     """
 
@@ -98,14 +99,13 @@ class StepRecord:
         step: 1-based number of the step.
         views: Positions in `scene.train_views`.
         names: Names of the views.
-        labels: Group labels of the views, or None.
+        labels: Group labels of the views; None without groups.
         losses: Photometric losses of the views, in the order of `views`.
         primitives: Number of primitives after the step.
-        counts: Counted events: `zero`, `disjoint`, `dropped`, `conflict` blocks of the aggregation,
-            `cloned`, `split`, `pruned`, `reset` primitives of the densification.
+        counts: Event -> number. The aggregation counts blocks: `zero`, `disjoint`, `dropped`,
+            `conflict`. The densification counts primitives: `cloned`, `split`, `pruned`, `reset`.
         train_seconds: Training seconds since the start of the run, this step included.
-        scales: The scales at which the views were rendered and compared; empty if all views had
-            their full size.
+        scales: The scales at which the views were rendered; empty if all views had their full size.
     """
 
     step: int
@@ -124,13 +124,13 @@ PhotoOf = Callable[[View], tuple[Tensor, Tensor | None]]
 
 
 def decoded(view: View) -> tuple[Tensor, Tensor | None]:
-    """Decode and return the photo and the mask of a view, without counting the time."""
+    """Return the decoded photo and mask of a view; the decoding time is not measured."""
     return view.photo.image(), view.photo.mask()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RequestedRender(RenderedView):
-    """A training view as it was rendered on request, through the run's exposure and loss.
+    """A training view that a plugin requested, rendered with the run's exposure and loss.
 
     Attributes:
         render: The output of the rasterizer.
@@ -158,8 +158,8 @@ class RenderOnRequest(Protocol):
     ) -> RequestedRender:
         """Return the rendered view.
 
-        The render is part of a graph if gradients are enabled (`torch.enable_grad()`). A densifier
-        that needs no gradients calls this function under `torch.no_grad()`.
+        The render is part of an autograd graph if gradients are enabled (`torch.enable_grad()`). A
+        densifier that needs no gradients calls this function under `torch.no_grad()`.
 
         Args:
             view: Position in `scene.train_views`.
@@ -192,7 +192,7 @@ class StepContext:
         step: 1-based number of the step.
         schedule: The schedule of the run.
         scene: The scene.
-        states: State of every plugin by the plugin's name; read only.
+        states: Plugin name -> state of the plugin; read only.
         rng: The random generator of the hook. Every random number of a plugin must come from this
             generator.
         photo: Returns the photo and the mask of a view on the run's device. The decoding time then
@@ -208,7 +208,7 @@ class StepContext:
     photo: PhotoOf = field(default=decoded, kw_only=True)
 
     def state(self, plugin: str) -> PluginState:
-        """Return the state that the plugin of this name returned last; empty at first."""
+        """Return the last state of the plugin with this name; empty before its first state."""
         return self.states.get(plugin, EMPTY_STATE)
 
 
@@ -217,7 +217,7 @@ class SampleContext(StepContext):
     """The context of `crossgrad_sample_views`.
 
     Attributes:
-        views_per_step: K of this step.
+        views_per_step: Number of views of this step, K.
         groups: Label of each training view, or None if the run has no grouping.
         centers: [N, 3] float64 camera centres of the training views, local frame.
         last: Record of the previous step; None in the first step.
@@ -255,7 +255,8 @@ class PixelContext(StepContext):
         index: Position of the view in `scene.train_views`.
         view: The view.
         camera: The camera of the render.
-        scale: Side length of the render divided by the side length of the photo as trained.
+        scale: Side length of the render divided by the side length of the photo at training
+            resolution.
         target: [H, W, 3] uint8 photo that the render is compared with, in the size of the render.
         mask: [H, W] bool, True where the pixel counts; None if every pixel counts.
     """
@@ -276,11 +277,12 @@ class AggregateContext(StepContext):
         gradients: The gradients of the K views; separate if the operator or a plugin requires
             separate gradients.
         losses: [K] float64 photometric losses.
-        labels: K group labels, or None.
-        distances: [K] float64 distance of each camera from the mean training camera, local units.
-        reference_distance: Median of the distances of all training cameras from the mean training
-            camera.
-        blocks: The blocks, in the order of every Gramian's first dimension.
+        labels: K group labels; None without groups.
+        distances: [K] float64 distance of each camera from the mean position of the training
+            cameras, local units.
+        reference_distance: Median distance of the training cameras from their mean position, local
+            units.
+        blocks: The blocks, in the order of the first dimension of arrays such as [B, K, K].
         scales: K scales at which losses and gradients were computed; empty if all are 1.
     """
 
@@ -313,10 +315,10 @@ class RegularizeContext(StepContext):
     """The context of `crossgrad_regularize`.
 
     Attributes:
-        parameters: The parameters, requiring gradients.
+        parameters: The parameters, which require gradients.
         backbone: The backbone.
-        gaussians: The Gaussians that the backbone decoded for this view, with their graph; None if
-            the hook is called for the whole step.
+        gaussians: The Gaussians that the backbone decoded for this view, with their autograd graph;
+            None if the hook is called for the whole step.
         view: The view; None if the hook is called for the whole step.
     """
 
@@ -331,15 +333,16 @@ class DensifyContext(StepContext):
     """The context of `crossgrad_densify`, which is called after every step.
 
     Attributes:
-        parameters: The parameters. Only the returned edit may change them.
+        parameters: The parameters. Only the returned edit may change the parameters.
         backbone: The backbone.
         rasterizer: The rasterizer, for statistics of views that this step did not render.
         views: The rendered views of the step with their screen statistics.
-        share: Number of `views` divided by the number of all views of the step; it is 1 unless
-            `--densify-views` changes it.
+        share: Number of `views` divided by the number of all views of the step; the quotient is 1
+            unless the user sets `--densify-views`.
         means_lr: Current learning rate of the primitives' positions.
-        room: How many primitives may still be added (`--max-gaussians`, memory guard).
-        may_grow: [P] bool, the primitives that may grow; None if all may grow.
+        room: Number of primitives that may still be added (`--max-gaussians`, memory guard).
+        may_grow: [P] bool, True for primitives that may be cloned or split; None if all primitives
+            may.
         render: Renders a training view that the densifier chooses. The render counts as training
             time and as a rendered view.
     """
@@ -360,7 +363,7 @@ class AfterStepContext(StepContext):
     """The context of the hooks `crossgrad_after_optimizer`, `_after_step` and `_step_done`.
 
     Attributes:
-        parameters: The parameters. Only the returned edit may change them.
+        parameters: The parameters. Only the returned edit may change the parameters.
         backbone: The backbone.
         means_lr: Current learning rate of the primitives' positions.
         edited: True if density control has already changed the set of primitives in this step.
@@ -379,7 +382,7 @@ class Answer:
     states: Mapping[str, PluginState] = field(default_factory=dict, kw_only=True)
 
     def with_state(self, plugin: str, state: PluginState) -> Self:
-        """Return the same result with a new state for the plugin of this name."""
+        """Return this result with a new state of the plugin with this name."""
         return replace(self, states={**self.states, plugin: state})
 
 
@@ -403,7 +406,7 @@ class AggregateResult(Answer):
 
     Attributes:
         gradients: Tensor name -> gradient; None if the optimizer must skip the tensor.
-        counts: Counted events of this step.
+        counts: Event -> number of occurrences in this step.
     """
 
     gradients: Mapping[str, Tensor | None]
@@ -434,7 +437,7 @@ class RunInfo:
         config: The resolved configuration as plain data.
         schedule: The schedule.
         blocks: The blocks of the backbone.
-        notes: Messages about choices and omissions, with reasons.
+        notes: Messages about the run's choices, with reasons.
         decisions: The table of decided settings.
     """
 
@@ -451,19 +454,20 @@ class RunInfo:
 class Model:
     """The model between two steps, for plugins that measure it.
 
-    Plugins must not change any of its contents.
+    Plugins must not change this object or its tensors.
 
     Attributes:
-        phase: The phase in which training decodes; `phase.step` is the last complete step.
+        phase: The phase that the backbone needs to decode the Gaussians; `phase.step` is the last
+            complete step.
         scene: The scene.
         backbone: The backbone.
         rasterizer: The rasterizer.
         parameters: The parameters.
         adam: The optimizer's moments.
-        rule: The averaging rule of Adam in the next step.
+        rule: The hyperparameters of Adam's moments in the next step.
         background: [3] RGB background of evaluated views.
         loss: The photometric loss.
-        groups: Group label of each training view, or None.
+        groups: Group label of each training view; None without groups.
         exposed: Applies the run's exposure to a render [H, W, 3] of a view, before the loss.
         render: Renders a training view that the observer chooses. The render counts neither as
             training time nor as a rendered view.
@@ -485,12 +489,13 @@ class Model:
 
 @dataclass(frozen=True)
 class EvaluationReport:
-    """An evaluation, for observers.
+    """The results of one evaluation, for observers.
 
     Attributes:
-        step: The step.
+        step: Step after which the views were evaluated.
         row: The new row of metrics.csv.
-        regimes: The regimes of the held-out views; `psnr_far` is the PSNR of regime `far`.
+        regimes: The regimes of the held-out views. For example, column `psnr_far` is the PSNR of
+            regime `far`.
     """
 
     step: int
@@ -504,24 +509,26 @@ class OperatorContext:
 
     Attributes:
         step: 1-based number of the step.
-        blocks: [B] name of each Gramian's block (`geometry`, `appearance` under granularity
-            `kind`, `all` under `global`; under `gaussian` one name for all rows of a block).
+        blocks: [B] name of the block that each Gramian belongs to. With granularity `kind`, the
+            names are kinds such as `geometry`; with `global`, the only name is `all`. With
+            `gaussian`, all Gramians of a block have the block's name.
         kinds: [B] kind of each block.
         losses: [K] float64 photometric losses.
-        labels: K group labels, or None.
-        distances: [K] float64 camera distances from the mean training camera, local units.
-        reference_distance: Median of the distances of all training cameras from the mean training
-            camera.
+        labels: K group labels; None without groups.
+        distances: [K] float64 distance of each camera from the mean position of the training
+            cameras, local units.
+        reference_distance: Median distance of the training cameras from their mean position, local
+            units.
         present: [B, K] bool, views whose gradient of the block is finite and not zero. For a view
-            that is False here, the row and column of the Gramian are zero, and the operator must
+            with the value False, the row and column of the Gramian are zero, and the operator must
             return weight 0.
         unit: Unit roundoff of the gradients' type. Results need not be more accurate than the unit
             roundoff.
         rounding_residuals: Computes [B, K, K], the parts of the Gramians that rounding to float64
             removed. The sum of Gramian and residual has twice as many correct digits. The
-            computation needs another, slower pass over the gradients. Use it only for Gramians that
-            are almost singular, because rounding then affects the result. None if no residuals can
-            be computed.
+            computation needs another, slower pass over the gradients. Use the residuals only for
+            Gramians that are almost singular, because rounding then affects the result. None if no
+            residuals can be computed.
         scales: K scales at which losses and gradients were computed; empty if all are 1.
     """
 

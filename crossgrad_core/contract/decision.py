@@ -17,8 +17,8 @@ class Decision:
         value: The value of the setting.
         because: The reason, in a few words.
         evidence: The facts or the results that support the reason.
-        override: The option that sets another value. Empty if the value is the published value; the
-            terminal does not report such decisions.
+        override: The option that sets another value. Empty if the value is the published value. The
+            terminal does not show decisions without an override.
     """
 
     setting: str
@@ -34,8 +34,8 @@ class Length:
 
     Attributes:
         planned: Planned number of steps.
-        total: Present number of steps. It differs from `planned` if a time budget made the run
-            longer or shorter.
+        total: Present number of steps. The number differs from `planned` if a time budget made the
+            run longer or shorter.
         start: Number of primitives at the start; None before they are counted.
     """
 

@@ -1,6 +1,6 @@
 """The description of a metric in the results: its name and its format.
 
-This module imports no large package.
+This module imports no large package, so that results can be read without torch.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,8 @@ class Figure:
         form: Number format of the metric in tables.
         per_regime: True if metrics.csv contains one column of this metric for every regime.
         definition: How the metric is computed, for summary.json; empty if the name is clear enough.
-        undefined: Why the metric may be undefined for a view that has pixels to compare.
+        undefined: Reason why the metric may be undefined for a view although the view has pixels to
+            compare.
         falls: True if a lower value is better.
     """
 

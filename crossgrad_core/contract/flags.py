@@ -1,4 +1,7 @@
-"""How a setting appears on the command line. The schema contains its type and bounds."""
+"""The appearance of a setting on the command line.
+
+The setting's pydantic field contains the type and the bounds.
+"""
 
 from dataclasses import dataclass
 from typing import Final
@@ -15,7 +18,7 @@ HEADINGS: Final = (CONFIGURATION, PARTS, TRAINING, SCENE, MACHINE, RESULTS)
 
 @dataclass(frozen=True)
 class Flag:
-    """The command-line option of a setting; type and help text come from the field.
+    """The command-line option of a setting; its type and help text come from the setting's field.
 
     Attributes:
         metavar: The placeholder for the option's value in the help text.

@@ -44,18 +44,18 @@ class Gaussians:
         colors: [N, 3] RGB.
         sh_dc: [N, 1, 3] band 0 coefficients.
         sh_rest: [N, B - 1, 3] higher bands (B = 4, 9 or 16), None at degree 0.
-        sh_degree: Active degree, 0 to 3.
-        response: How a Gaussian fills a pixel.
-        dilation: Added to both diagonal entries of the 2-D covariance, px^2; None uses the dilation
-            of the rasterizer.
+        sh_degree: Active degree of the spherical harmonics, 0 to 3.
+        response: Formula of a Gaussian's opacity in a pixel, see `Response`.
+        dilation: Number that is added to both diagonal entries of the 2-D covariance, px^2; None
+            uses the dilation of the rasterizer.
         origin: [N] int64, the primitive of each Gaussian; None if Gaussian i is primitive i.
         slot: [N] int64, index of each Gaussian among the Gaussians of its primitive; None if every
             primitive gives one Gaussian.
         decoded: [P] bool, the primitives that were decoded for this view, with or without a
             resulting Gaussian; None if all were decoded.
         on_demand: Tensors whose rows must be requested before they are read. The gradients of these
-            tensors are sparse, by rows. None if all rows are up to date. Only rasterizers with
-            `sparse_rows` receive this field.
+            tensors are sparse tensors of whole rows. None if all rows are up to date. Only
+            rasterizers with `sparse_rows` receive this field.
     """
 
     means: Tensor
@@ -114,7 +114,7 @@ class Gaussians:
         return self.mapped(torch.Tensor.detach)
 
     def misfit(self) -> str | None:
-        """Return the first mismatch, such as `colors is [5, 1], not [5, 3]`; None if all fit."""
+        """Return the first wrong shape, such as `colors is [5, 1], not [5, 3]`; else None."""
         if (self.colors is None) == (self.sh_dc is None):
             return "either colors or sh_dc must be given, not both or neither"
         number, rest, degree = len(self), self.sh_rest, self.sh_degree
@@ -147,7 +147,7 @@ class Gaussians:
 class _Whole(Gaussians):
     """Gaussians that update all rows of a tensor when the tensor is read.
 
-    Every kind of copy gives a plain `Gaussians` object whose rows are all up to date.
+    Copying or pickling gives a plain `Gaussians` object whose rows are all up to date.
     """
 
     @override
@@ -199,8 +199,9 @@ class Screen:
     The gradient fields are None before the backward pass of the render.
 
     Attributes:
-        radii: [N] int32, pixels; 0 if the Gaussian touches no pixel.
-        pixels: [N] int32, pixels in which the Gaussian was blended; None unless requested.
+        radii: [N] int32, radius on the screen in pixels; 0 if the Gaussian touches no pixel.
+        pixels: [N] int32, number of pixels in which the Gaussian was blended; None unless
+            requested.
         mean_gradient: [N, 2] gradient of the loss with respect to the projected mean, in pixel
             coordinates.
         abs_gradient: [N, 2] like `mean_gradient`, but with the absolute values summed over the
@@ -214,11 +215,12 @@ class Screen:
             Each bin contains 5 numbers about its pixels whose gradient is not 0. The first two
             numbers are the sum of the gradients' directions (x and y). A direction is the unit
             vector of the gradient in NDC units, that is, of the gradient times width and height.
-            The next two numbers are the sums of |x| and |y| of the gradients in pixel coordinates;
-            summed over all bins they are `abs_gradient`. The last number is the number of pixels
-            with a gradient that is not 0.
-        count: Function [H, W] bool -> [N] int32: in how many of the marked pixels each Gaussian was
-            blended; None unless requested. The function keeps data of the render in memory.
+            The next two numbers are the sums of |x| and |y| of the gradients in pixel coordinates.
+            The sum of these two numbers over all bins is `abs_gradient`. The last number is the
+            number of pixels with a gradient that is not 0.
+        count: Function [H, W] bool -> [N] int32: the number of marked pixels in which each Gaussian
+            was blended; None unless requested. The data of the render stay in memory as long as
+            this function exists.
         rows: [R] int64, sorted; contains every Gaussian with a radius above 0. None if the
             rasterizer provides no such list.
     """

@@ -43,13 +43,13 @@ COORDINATES_TAG = "crossgrad_coordinates:"
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """Gaussians that are about to be written to a file.
+    """Gaussians in the coordinates in which an export writes them to a file.
 
     Attributes:
-        gaussians: Gaussians in a frame that may be rotated against the local frame.
+        gaussians: Gaussians in a frame that may be rotated with respect to the local frame.
         similarity: Maps the frame of `gaussians` to the coordinates of the file.
-        facts: Contents of `.georef.json`, for programs that read the file; empty if nothing is
-            known.
+        facts: Contents of the file `.georef.json`; empty if there are no facts about the
+            coordinates.
         notes: Messages for the user, one sentence each.
         rotation: [3, 3] float64, rotates the local frame to the frame of `gaussians`. Both frames
             have the same origin and scale.
@@ -66,7 +66,7 @@ class Placed:
 
 
 class Georeference(Protocol):
-    """The location of a scene on Earth, as far as it is known."""
+    """The location of a scene on Earth, or the reason why the location is not known."""
 
     @property
     def note(self) -> str:
@@ -113,7 +113,7 @@ class Unplaced:
         return
 
     def placed(self, gaussians: Gaussians, similarity: Similarity, coordinates: str) -> Placed:
-        """Refuse every placement; see `Georeference`."""
+        """Return the Gaussians in input or local coordinates; refuse all other coordinates."""
         if coordinates == INPUT:
             return Placed(gaussians, similarity)
         if coordinates == LOCAL:

@@ -1,4 +1,7 @@
-"""Gradients of K views. Operators use only Gramians, weighted sums and element-wise functions."""
+"""The gradients of the K views of a step.
+
+Operators use these gradients only through Gramians, weighted sums and element-wise functions.
+"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -47,11 +50,11 @@ class Gradients(ABC):
     def total(self, divisor: int = 1) -> Mapping[str, Tensor | None]:
         """Return the sum over the views for each tensor, in the order of the views.
 
-        Accumulation in the backward passes would give the same bits.
+        The sum is bitwise equal to the gradient that the backward passes would accumulate.
 
         Args:
-            divisor: Number by which the sums are divided, without a further pass over the data. If
-                it is K, the result is the mean.
+            divisor: Number by which the sums are divided, without a further pass over the data. The
+                divisor K gives the mean.
 
         Returns:
             Tensor name -> sum; None for tensors that no view touches, or whose views are all
@@ -61,7 +64,7 @@ class Gradients(ABC):
 
 
 class SeparateGradients(Gradients):
-    """The separate gradients of the K views of one step; operators do not see their elements.
+    """The separate gradients of the K views of one step; operators cannot read single elements.
 
     `elementwise` passes dense tensors to its function and expects dense results.
     """
@@ -83,8 +86,8 @@ class SeparateGradients(Gradients):
     def rounding_residuals(self, granularity: Granularity) -> NDArray[np.float64]:
         """Return [B, K, K], the parts of the Gramians that rounding removed.
 
-        The sum of Gramian and residual has twice as many correct digits. The call is ten times as
-        slow as `gramians`.
+        The sum of Gramian and residual has twice as many correct digits. The call takes ten times
+        as long as `gramians`.
         """
 
     @override
@@ -108,7 +111,8 @@ class SeparateGradients(Gradients):
         """Return the sum over views of weight times gradient, for each tensor.
 
         Args:
-            weights: [B, K]; a view that is not finite for a block is left out, whatever its weight.
+            weights: [B, K]; a view whose gradient of a block is not finite is left out, whatever
+                its weight.
             granularity: The granularity that `weights` was computed for.
 
         Returns:

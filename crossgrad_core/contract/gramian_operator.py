@@ -17,14 +17,15 @@ from crossgrad_core.contract.gradients import Granularity, SeparateGradients
 from crossgrad_core.contract.slots.operator import Operator
 from crossgrad_core.errors import UserError
 
-#: If the unit roundoff of gradients is below this, the rounding of float64 weights matters.
+#: If the unit roundoff of the gradients is below this value, rounding errors of float64 weights
+#: change the result.
 _NARROW: Final = 1e-12
 
 
 class MatrixOperator(Operator):
-    """An operator that replaces the K gradients G of each block by M G and adds the rows of M G.
+    """An operator that multiplies a block's K gradients G by a matrix M and adds the rows of M G.
 
-    Such an operator can be a link of a chain and can be used for single blocks.
+    Such an operator can be used in a chain of operators and for single blocks.
     """
 
     sparse_rows: ClassVar[bool] = True
@@ -61,9 +62,8 @@ class GramianOperator(MatrixOperator):
     """An operator whose matrices depend on the Gramians.
 
     Attributes:
-        granularity: The parts of the gradient that share one Gramian: each block, all geometry
-            blocks and all appearance blocks, all blocks together, or each Gaussian's row of a
-            block.
+        granularity: The extent of one Gramian: a block (`block`), all blocks of a kind (`kind`),
+            all blocks (`global`), or one Gaussian's row of a block (`gaussian`).
     """
 
     sparse_rows: ClassVar[bool] = True
@@ -128,14 +128,13 @@ def aggregate_by_gramians(
 ) -> tuple[AggregateResult, PluginState]:
     """Aggregate gradients with the matrices of an operator.
 
-    This takes one pass for the Gramians of all blocks, one small solve, and one pass for the
-    weighted sums.
+    The aggregation takes one pass for the Gramians of all blocks, one small solve, and one pass for
+    the weighted sums.
 
-    The result counts the blocks in which one of four events occurred; with another granularity, it
-    counts the Gramians. The events are: a view has no gradient or a gradient of exactly zero
-    (`zero`), two non-zero gradients have no common element (`disjoint`), a view was left out
-    because its gradient is not finite (`dropped`), or two gradients have a negative dot product
-    (`conflict`).
+    The result counts the Gramians in which an event occurred; with granularity `block`, each block
+    has one Gramian. Event `zero`: a view has no gradient or a gradient of exactly zero. Event
+    `disjoint`: two non-zero gradients have no common element. Event `dropped`: a view was left out
+    because its gradient is not finite. Event `conflict`: two gradients have a negative dot product.
 
     Raises:
         UserError: The operator returned weights that are not finite.
@@ -163,7 +162,7 @@ def transformed(
 ) -> tuple[NDArray[np.float64], PluginState]:
     """Return the checked result of an operator's `transform`.
 
-    Operators that contain other operators call them through this function.
+    An operator that contains other operators calls the other operators through this function.
 
     Raises:
         UserError: The result has a wrong type or shape.
@@ -178,8 +177,8 @@ def transformed(
 def _added_rows(matrices: NDArray[np.float64], unit: float) -> NDArray[np.float64]:
     """Return [B, K], the sum over R of matrices [B, R, K].
 
-    The sum is taken row by row, because NumPy is slow at short sums. For gradients in float64, the
-    rounding errors of the additions are compensated (Neumaier 1974).
+    The sum is computed row by row, because NumPy is slow at sums over few rows. For gradients in
+    float64, the rounding errors of the additions are compensated (Neumaier 1974).
     """
     total = np.zeros((matrices.shape[0], matrices.shape[2]))
     lost = np.zeros_like(total)
@@ -215,7 +214,7 @@ def operator_context(
 def _kinds(
     names: Sequence[str], blocks: Sequence[Block], granularity: Granularity
 ) -> tuple[BlockKind, ...]:
-    """Return the kinds of blocks.
+    """Return the kind of each block, or of each group of blocks.
 
     A group of blocks is named by its kind; the group `all` is neutral.
     """
@@ -225,7 +224,8 @@ def _kinds(
         "neutral": "neutral",
         "all": "neutral",
     }
-    if granularity in {"block", "gaussian"}:  # A block may have the same name as a group.
+    # Use the names of the blocks as keys, because a block may have the same name as a group.
+    if granularity in {"block", "gaussian"}:
         kind_by_name = {block.name: block.kind for block in blocks}
     return tuple(map(kind_by_name.__getitem__, names))
 

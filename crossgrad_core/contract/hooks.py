@@ -2,8 +2,8 @@
 
 Three hooks of a training step are first-result hooks, which the selected component answers:
 `crossgrad_sample_views`, `crossgrad_aggregate_gradients` and `crossgrad_densify`. Any other plugin
-may wrap them (`@hookimpl(wrapper=True)`) to watch the call or replace its result. A first-result
-hook must return a value; None is an error.
+may wrap these hooks (`@hookimpl(wrapper=True)`) to watch a call or replace its result. A
+first-result hook must return a value; None is an error.
 """
 
 from collections.abc import Mapping
@@ -44,20 +44,20 @@ class HookSpecs:
 
     @hookspec
     def crossgrad_validate_selection(self, selection: "Selection") -> "list[str] | None":
-        """Return reasons why this selection of components cannot work; called before training.
+        """Return reasons why the selected components cannot work together; called before training.
 
         All plugins answer this hook. A single reason is enough to refuse the run.
         """
 
     @hookspec
     def crossgrad_run_start(self, run: "RunInfo") -> None:
-        """Event: the scene was read and the components were chosen; no step was taken yet."""
+        """Event: the scene was read and the components were chosen; no step has begun."""
 
     @hookspec
     def crossgrad_update_intervals(self, blocks: "tuple[Block, ...]") -> "Mapping[str, int] | None":
-        """Return tensor name -> N for tensors that learn in only one of N steps.
+        """Return tensor name -> N for tensors that are updated in only one of N steps.
 
-        All plugins answer this hook, once per run. In the steps in which such a tensor learns, its
+        All plugins answer this hook, once per run. In the steps that update such a tensor, its
         learning rate is multiplied by sqrt(N).
         """
 
@@ -67,19 +67,19 @@ class HookSpecs:
 
     @hookspec(firstresult=True)
     def crossgrad_choose_scales(self, context: "ScaleContext") -> "ScaleResult | None":
-        """Return the scale at which each drawn view is rendered and compared (resolution slot)."""
+        """Return the scale at which each drawn view is rendered for the loss (resolution slot)."""
 
     @hookspec
     def crossgrad_view_gaussians(self, context: "GaussiansContext") -> "GaussiansResult | None":
         """Return the Gaussians to render for a training view; None keeps the Gaussians unchanged.
 
-        All plugins are called in turn, once per view. Each plugin gets the Gaussians that the
-        previous plugin returned.
+        All plugins are called one after another, once per view. Each plugin gets the Gaussians that
+        the previous plugin returned.
         """
 
     @hookspec
     def crossgrad_pixel_weights(self, context: "PixelContext") -> "Tensor | None":
-        """Return the weight of each pixel of a view in its loss, [H, W], not negative.
+        """Return the weight of each pixel in the loss of a view, [H, W], not negative.
 
         All plugins answer this hook, once per view; None means equal weights. The results are
         multiplied.
@@ -114,7 +114,7 @@ class HookSpecs:
     def crossgrad_after_optimizer(self, context: "AfterStepContext") -> "DensifyResult | None":
         """Return an edit of values after the optimizer and before density control; or None.
 
-        All plugins are called in turn. The set of primitives must not change.
+        All plugins are called one after another. The set of primitives must not change.
         """
 
     @hookspec(firstresult=True)
@@ -127,7 +127,7 @@ class HookSpecs:
 
     @hookspec
     def crossgrad_step_done(self, context: "AfterStepContext") -> "Answer | None":
-        """Return new states that follow the parameters after a complete step, such as an average.
+        """Return new plugin states after a complete step, such as an average of the parameters.
 
         `context.edited` is True if the set of primitives changed in this step, or if density
         control overwrote values.
@@ -151,7 +151,8 @@ class HookSpecs:
     def crossgrad_final_edit(self, model: "Model") -> "FinalEdit | None":
         """Return the edit of a finished run, before it is evaluated and exported; or None.
 
-        All plugins are called in turn. `model.parameters` are the parameters that evaluations use.
+        All plugins are called one after another. `model.parameters` are the parameters that
+        evaluations use.
         """
 
     @hookspec

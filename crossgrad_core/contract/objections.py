@@ -1,4 +1,4 @@
-"""Objections to a selection: combinations that cannot work, and options without effect."""
+"""Objections to the selected components: impossible combinations, and options without effect."""
 
 from collections.abc import Iterator, Mapping
 

@@ -16,21 +16,21 @@ from crossgrad_core.contract.georeference import UNPLACED, Georeference, Similar
 
 #: Minimum number of cameras for a search for stray cameras.
 _FEWEST: Final = 5
-#: Largest share of stray cameras. A single stray camera is always possible.
+#: Maximum share of stray cameras. One stray camera is always allowed.
 _MOST: Final = 0.1
-#: A camera is stray if its distance from the middle is more than this many times the distance of
-#: all other cameras and of the points.
+#: A camera is stray if its distance from the median camera centre exceeds the distances of all
+#: other cameras and of most points by this factor.
 _FAR: Final = 10.0
-#: Quantile of the points' distances that is used instead of the maximum, because single points may
-#: be stray, too.
+#: Quantile of the points' distances. The quantile is used instead of the maximum, because single
+#: points may also be stray.
 _OF_POINTS: Final = 0.9
 
 
 def stray_rows(centers: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return [N], True for cameras ten times farther away than other cameras and most points.
+    """Return [N], True for cameras ten times farther from the scene than other cameras and points.
 
-    A camera that photographs the scene from far away is not an outlier, because the points show the
-    size of the scene.
+    A far camera is not an outlier if the points extend as far, because the points show the size of
+    the scene.
 
     Args:
         centers: [N, 3] camera centres.
@@ -43,7 +43,7 @@ def stray_rows(centers: NDArray[np.float64], points: NDArray[np.float64]) -> NDA
     away = np.linalg.norm(centers - middle, axis=1)
     most = max(1, int(_MOST * len(centers)))
     order = np.argsort(away)
-    # The widest gap among the farthest cameras separates the stray cameras.
+    # The widest gap among the farthest cameras separates stray cameras from the other cameras.
     ratios = away[order][-most:] / np.maximum(away[order][-most - 1 : -1], np.finfo(float).tiny)
     first = len(centers) - most + int(ratios.argmax())
     reach = away[order[first - 1]]
@@ -61,12 +61,12 @@ class Pinhole:
     """An undistorted calibration in pixels; pixel centres are at +0.5.
 
     Attributes:
-        width: Pixels.
-        height: Pixels.
+        width: Image width in pixels.
+        height: Image height in pixels.
         fx: Horizontal focal length in pixels.
         fy: Vertical focal length in pixels.
-        cx: Principal point in pixels from the left image border.
-        cy: Principal point in pixels from the top image border.
+        cx: Distance of the principal point from the left image border in pixels.
+        cy: Distance of the principal point from the top image border in pixels.
     """
 
     width: int
@@ -147,7 +147,7 @@ class View:
 
     Attributes:
         name: Path relative to the image folder with forward slashes.
-        camera: The camera, in the size of the photo as trained.
+        camera: The camera, for the photo at training resolution.
         photo: The photo, decoded on request.
         regime: Label of the camera group under which results are reported.
         seen: [S] int64 indices of the SfM points that this view observed; may be empty.
@@ -171,16 +171,16 @@ class Scene:
     Attributes:
         name: Short name, used for the output folder.
         views: All views, sorted by name.
-        train: Positions in `views` that are trained on.
-        test: Positions in `views` that are held out.
+        train: Positions of the training views in `views`.
+        test: Positions of the held-out views in `views`.
         points: [P, 3] float64 SfM points, local frame.
         point_colors: [P, 3] uint8 RGB.
         similarity: Maps the local frame back to the input frame.
         notes: Changes to the input, with reasons (undistorted, resized, images left out ...).
-        point_sizes: [P] standard deviations of the initial Gaussians, local units; NaN if the
-            distance to the neighbours decides. None means NaN at all points.
-        point_opacities: [P] opacities of the initial Gaussians; NaN if the rule of the backbone
-            decides. None means NaN at all points.
+        point_sizes: [P] standard deviations of the initial Gaussians, local units; NaN if the size
+            is computed from the distance to the neighbours. None means NaN at all points.
+        point_opacities: [P] opacities of the initial Gaussians; NaN if the backbone computes the
+            opacity. None means NaN at all points.
         georeference: Location of the scene on Earth.
         files: Files that the scene was read from, except photos and masks.
         check: Results of the consistency check of the scene; None before the check.
@@ -221,7 +221,7 @@ class Scene:
 
     @cached_property
     def train_views(self) -> tuple[View, ...]:
-        """The training views, in the order that samplers index."""
+        """The training views, in the order of the indices that samplers use."""
         return tuple(self.views[i] for i in self.train)
 
     @cached_property
@@ -280,23 +280,23 @@ def centers_of(views: Sequence[View]) -> NDArray[np.float64]:
     return np.stack([view.camera.center.numpy() for view in views]).astype(np.float64)
 
 
-#: With fewer observed points than this, a median is unreliable, so points in the image are used
+#: If a view observed fewer points than this number, the median over all points in its image is used
 #: instead.
 _FEWEST_SEEN = 3
 #: Maximum number of points that are tested against the image of a view that observed too few
 #: points.
 _MOST_TESTED = 50_000
-#: Number of significant bits of a length between cameras. Further bits are rounding errors.
+#: Number of significant bits of a distance between cameras. The remaining bits are rounding errors.
 _BITS = 40
-#: Relative error of an input coordinate from its rounding and the rounding of a few sums.
+#: Relative rounding error of an input coordinate and of a few sums of coordinates.
 _ROUNDED = 16 * float(np.finfo(np.float64).eps)
 
 
 def radial_distances(scene: Scene, views: Sequence[View]) -> NDArray[np.float64]:
     """Return [V], the distance of each camera from the mean training camera centre, local units.
 
-    Rounding errors are removed: a camera at this centre has distance 0, and distances that differ
-    only by rounding become equal.
+    Rounding errors are removed. A camera at the mean centre gets the distance 0. Distances that
+    differ only by rounding errors become equal.
     """
     return without_rounding(scene, np.linalg.norm(centers_of(views) - scene.middle, axis=1))
 
@@ -306,8 +306,8 @@ def without_rounding(scene: Scene, lengths: NDArray[np.float64]) -> NDArray[np.f
 
     In regular camera layouts, equal distances differ by the rounding error of the mean camera
     centre. A threshold at the median, a rank or a logarithm would depend on this rounding error. If
-    the rounding error of the scene's input coordinates is larger than this, the lengths are rounded
-    to the larger error.
+    the rounding error of the scene's input coordinates is larger than 2^-40 of the largest
+    coordinate, the lengths are rounded to this rounding error.
     """
     largest = float(np.abs(scene.centers).max(initial=0.0))
     given = float(np.abs(scene.similarity.to_input(scene.centers)).max(initial=0.0))
@@ -319,18 +319,19 @@ def without_rounding(scene: Scene, lengths: NDArray[np.float64]) -> NDArray[np.f
 
 
 def footprint_of(scene: Scene, view: View) -> float:
-    """Return the `footprint` of a view of the scene."""
+    """Return the pixels per local unit at the points that a view observed; see `footprint`."""
     return footprint(view.camera, scene.points, view.seen)
 
 
 def footprint(camera: Camera, points: NDArray[np.float64], seen: NDArray[np.int64]) -> float:
     """Return the median of f / z [pixels per local unit] over a camera's observed SfM points.
 
-    If the camera observed fewer than 3 points in front of it, all points in its image are used
-    instead. If there are no such points either, the result is NaN.
+    Here f is the focal length and z the depth of a point. If the camera observed fewer than 3
+    points in front of it, all points in its image are used instead. If no point is in the image,
+    the observed points are used. Without any point, the result is NaN.
 
     Args:
-        camera: The camera, in the size of the photo as trained.
+        camera: The camera, for the photo at training resolution.
         points: [P, 3] SfM points, local frame.
         seen: Rows of `points` that the camera observed.
     """
@@ -350,7 +351,7 @@ def _in_front(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def is_in_image(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return [P], True for points [P, 3] (local frame) in a camera's image, even if hidden."""
+    """Return [P], True for points [P, 3] (local frame) in a camera's image; ignore occlusion."""
     local = camera.local(points)
     front = local[:, 2] > 0.0
     depth = np.where(front, local[:, 2], 1.0)
@@ -359,7 +360,7 @@ def is_in_image(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.bool_
 
 
 def masked(image: Tensor, mask: Tensor | None) -> Tensor:
-    """Return the image [H, W, C] with 0 at masked-out pixels, even if they contain NaN."""
+    """Return the image [H, W, C] with 0 at masked-out pixels; a NaN there is replaced, too."""
     if mask is None:
         return image
     return torch.where(mask.unsqueeze(-1), image, image.new_zeros(()))

@@ -60,5 +60,5 @@ class SceneOptions(BaseModel):
 
     @property
     def init_file(self) -> Path | None:
-        """The PLY file from which the run starts; None if it starts from points."""
+        """The PLY file from which the run starts; None if the run starts from points."""
         return None if self.init in {"points", "random"} else Path(self.init)

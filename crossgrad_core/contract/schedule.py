@@ -28,7 +28,7 @@ class ViewsPerStep:
         return self.counts[max(0, bisect_left(self.starts, step) - 1)]
 
     def views(self, step: int) -> int:
-        """Return the number of views drawn in all steps up to and including this one."""
+        """Return the number of views drawn in all steps up to and including `step`."""
         ends = (*self.starts[1:], step)
         parts = zip(self.starts, ends, self.counts, strict=True)
         return sum(max(0, min(end, step) - start) * count for start, end, count in parts)
@@ -43,10 +43,10 @@ class ViewsPerStep:
         return start + max(0, -((self.views(start) - views) // count))
 
     def moved(self, wanted: "ViewsPerStep", step: int) -> "ViewsPerStep":
-        """Return these values of K, with the changes that are still ahead moved as in `wanted`.
+        """Return the values of K after a change of the run's length; past changes of K do not move.
 
         Args:
-            wanted: K of a run of another length.
+            wanted: Values of K of a run that had the new length from its start.
             step: Number of completed steps.
         """
         pairs = zip(self.starts, wanted.starts, strict=True)
@@ -60,11 +60,11 @@ ONE_BY_ONE: Final = ViewsPerStep()
 
 @dataclass(frozen=True)
 class ViewsPerStepSpec:
-    """K over a run of any length: one number, or several numbers that start at given shares.
+    """K of a run of any length: one number, or several numbers that begin at shares of the run.
 
     Attributes:
         counts: The values of K.
-        shares: The share of the run's steps after which each K begins, except the first.
+        shares: The share of the run's steps after which each K begins; the first K has no share.
     """
 
     counts: tuple[int, ...] = (1,)
@@ -72,7 +72,7 @@ class ViewsPerStepSpec:
 
     @classmethod
     def parsed(cls, text: str) -> "ViewsPerStepSpec":
-        """Return the specification that a text such as `2` or `1..2@0.5` describes.
+        """Return the specification in a text such as `2` or `1..2@0.5`.
 
         Raises:
             ValueError: The text does not describe a specification.
@@ -109,7 +109,7 @@ class ViewsPerStepSpec:
         return ViewsPerStep((0, *(round(share * total) for share in self.shares)), self.counts)
 
     def steps_of(self, views: int) -> int:
-        """Return the largest number of steps that draws at most `views` views."""
+        """Return the largest number of steps in which a run draws at most `views` views."""
         fits, too_many = 0, views // min(self.counts) + 1
         while too_many - fits > 1:
             steps = (fits + too_many) // 2
@@ -124,33 +124,32 @@ class ViewsPerStepSpec:
 ONE_VIEW: Final = ViewsPerStepSpec()
 ScheduleMode = Literal["scaled", "absolute"]
 Unit = Literal["views", "steps"]
-#: The length that all published numbers refer to (3DGS), with one view per step.
+#: Number of steps of a run of 3DGS, with one view per step. All published numbers refer to this
+#: length.
 REFERENCE = 30_000
-#: Length in views up to which the settings for short runs apply in full.
+#: Length in views up to which the settings for short runs have their full effect.
 SHORT = 3_000
-#: The learning-rate schedules of colour, scale and opacity are not stretched to the length of the
-#: run. The first transient therefore always takes some hundred steps. Gradients are large
-#: everywhere during the transient. Growth in this time would copy Gaussians that only need to
-#: converge.
+#: Shortest warm-up without growth. In the first few hundred steps of a run of any length, gradients
+#: are large everywhere. Growth in these steps would copy Gaussians that only need to converge.
 SHORTEST_WARM_UP = 500
 #: Shortest interval over which growth statistics are collected (the published interval).
 SHORTEST_INTERVAL = 100
-#: Shortest interval for anchors, whose counts of rarely rendered offsets carry over to the next
-#: interval. It is half the published interval, because short runs grow too few anchors
-#: (docs/benchmarks.md).
+#: Shortest interval of anchor growing. The number is half the published interval, because short
+#: runs grow too few anchors with the published interval (docs/benchmarks.md).
 SHORTEST_ANCHOR_INTERVAL = 50
-#: Runs shorter than this make no opacity reset, because they are too short to recover from it.
+#: Runs with a length below this number make no opacity reset, because these runs are too short to
+#: recover from a reset.
 SHORTEST_RUN_WITH_RESET = 10_000
 #: If edits are counted in views, an interval is one pass over the training photos. The interval is
 #: shorter if the run would otherwise make fewer edits than this number.
 USUAL_EDITS = 6
-#: Shortest interval of a run with a minimum number of edits. With statistics of fewer views, nearly
-#: every Gaussian would grow.
+#: Shortest interval of edits in a run with a minimum number of edits. With statistics of fewer
+#: views, nearly every Gaussian would be cloned or split.
 LEAST_INTERVAL = 8
 
 
 def is_published(mode: ScheduleMode, reference: int | None) -> bool:
-    """Return True if a schedule uses the published numbers, whatever the length of the run."""
+    """Return True if a schedule uses the published numbers in a run of any length."""
     return mode == "absolute" and reference is None
 
 
@@ -163,8 +162,8 @@ class Counting:
         views: Number of views per step.
         photos: Number of training photos. An edit uses the statistics of at least this many views
             if the run is long enough.
-        schedule_length: Length that the schedule is written for. None stands for the length of the
-            run, or for the published length.
+        schedule_length: Length for which the schedule is written. If None, a scaled schedule uses
+            the length of the run, and an absolute schedule uses the published length.
         min_refinements: Minimum number of density control edits in a run of any length. In a short
             run, warm-up and interval are shortened to reach this number. This field is used only if
             the schedule counts views.
@@ -187,27 +186,27 @@ class Schedule:
     Attributes:
         mode: `scaled` if the published schedule was stretched with the run, else `absolute`.
         total: Length of the run, in steps.
-        length: The length that the schedule is written for: the run's own length if it was
-            stretched.
+        length: The length for which the schedule is written; the run's own length if the schedule
+            was stretched.
         lr_until: Count at which the log-linear learning-rate decay ends.
         sh_interval: The SH degree grows by one at every multiple of this count.
-        densify_from: Density control edits after this count. If views are counted, the edits are
-            at this count plus multiples of the interval; if steps are counted, at multiples of the
-            interval.
-        densify_until: Density control edits before this count.
+        densify_from: Density control makes edits after this count. If views are counted, the edits
+            are at this count plus multiples of the interval; if steps are counted, at multiples of
+            the interval.
+        densify_until: Density control makes edits before this count only.
         densify_every: Interval of edits.
         reset_every: Interval of opacity resets; None if there are no resets.
         anchors_from: Anchor growing starts after this count.
         anchors_every: Interval of anchor growing.
-        coarse_until: Count from which backbones that train from coarse to fine use all levels.
+        coarse_until: From this count on, backbones that train from coarse to fine use all levels.
         sh_from: SH degree at the first step.
-        sh_wait: Count before which the SH degree does not grow.
+        sh_wait: The SH degree does not grow before this count.
         counting: The unit of the counts.
-        pace: K of every step.
+        pace: Number of views K of every step.
         edits_before: Number of edits before `densify_from` in a run whose length a time budget
             changed.
-        min_refinements: Minimum number of edits that a change of length keeps, if the run is long
-            enough.
+        min_refinements: Minimum number of edits of the run, also after a change of its length, if
+            the run is long enough.
     """
 
     mode: ScheduleMode
@@ -235,8 +234,9 @@ class Schedule:
     ) -> "Schedule":
         """Return the schedule of a run of `total` steps.
 
-        `scaled` stretches the published schedule to the run, with lower bounds. `absolute` uses
-        the numbers of the published length, or of `counting.schedule_length`.
+        Mode `scaled` stretches the published schedule to the length of the run, with lower bounds
+        on intervals. Mode `absolute` uses the numbers of the published length, or of
+        `counting.schedule_length`.
         """
         pace = counting.views.paced(total)
         run_length = pace.views(total) if counting.unit == "views" else total
@@ -266,10 +266,10 @@ class Schedule:
     ) -> "Schedule":
         """Return the schedule with another window of density control.
 
-        If edits are counted in views, interval and start are fitted to the window. An interval is
-        at least one pass over the training photos if the window then still contains `USUAL_EDITS`
-        edits. The start and the interval are shortened if the window would contain fewer than
-        `min_refinements` edits.
+        If the schedule counts views, the interval and the start are fitted to the window. An
+        interval is at least one pass over the training photos if the window then still contains
+        `USUAL_EDITS` edits. The start and the interval are shortened if the window would contain
+        fewer than `min_refinements` edits.
 
         Args:
             until: Edits end before this count.
@@ -282,7 +282,7 @@ class Schedule:
         if self.counting.unit == "views" and not self.published:
             every = max(every, min(photos, (last - start) // USUAL_EDITS))
         if self.min_refinements:
-            # The interval is at least one pass over the photos, if this leaves enough edits.
+            # Use an interval of at least one pass over the photos if enough edits then still fit.
             whole = max(every, photos) if photos <= last // self.min_refinements else every
             start, every = _fitted(start, last, whole, photos, self.min_refinements)
         return replace(self, densify_from=start, densify_until=until, densify_every=every)
@@ -309,33 +309,36 @@ class Schedule:
         return self.counted(step) / self.lr_until
 
     def edits(self, after: int = 0) -> int:
-        """Return the number of steps after step `after` in which density control edits."""
+        """Return the number of steps after step `after` in which density control makes an edit."""
         ahead = self._edits_ahead(after)
         if self.counting.unit == "steps" or self.densify_every >= max(self.pace.counts):
             return len(ahead)
         return len(self.edit_steps(after))
 
     def edit_steps(self, after: int = 0) -> list[int]:
-        """Return the steps after step `after` in which density control edits, in order."""
+        """Return the steps after step `after` in which density control makes an edit, in order."""
         return sorted({self.step_of(count) for count in self._edits_ahead(after)})
 
     def _edits_ahead(self, after: int) -> range:
-        """Return the counts after a step at which an edit is due."""
+        """Return the counts of all planned edits after a step."""
         end = min(self.densify_until, self.counted(self.total) + 1)
         return range(self.next_edit(self.counted(after)), end, self.densify_every)
 
     @property
     def grows(self) -> bool:
-        """True if density control makes or made an edit in this run."""
+        """True if density control makes at least one edit in this run.
+
+        Edits before a change of the run's length count, too.
+        """
         return self.edits_before + self.edits() > 0
 
     @property
     def first_edit(self) -> int:
-        """The first step in which density control makes an edit; None without edits."""
+        """The step of the first density control edit; it may be after the end of the run."""
         return self.step_of(self.next_edit(0))
 
     def next_edit(self, count: int) -> int:
-        """Return the count of the first edit after `count`, even if this is after the last edit."""
+        """Return the count of the first edit after `count`, even after the last planned edit."""
         # If steps are counted, edits are at multiples of the interval, as published.
         every, origin = self.densify_every, 0
         if self.counting.unit == "views":
@@ -344,17 +347,17 @@ class Schedule:
         return origin + ((behind - origin) // every + 1) * every
 
     def with_length(self, wanted: "Schedule", step: int) -> "Schedule":
-        """Return this schedule with the length of another schedule, from the end of a step on.
+        """Return this schedule with the length of another schedule for all steps after `step`.
 
         The ends of the run, of the learning-rate decay and of density control move if they are
-        still ahead. Changes of K that are still ahead move as well. Intervals do not change, so
-        that no event happens twice or is omitted. Density control does not restart after its end.
+        after `step`. Changes of K after `step` move, too. Intervals do not change; otherwise an
+        event could occur twice or be omitted. Density control does not restart after its end.
         Levels and spherical harmonics that are already in use stay in use. If a minimum number of
-        edits is set, the remaining edits are planned again. The start of the edits moves if no edit
-        was made yet. The interval shrinks if there would be too few edits.
+        edits is set, the remaining edits are planned again. If no edit was made yet, the start of
+        the edits moves, too. The interval shrinks if there would be too few edits.
 
         Args:
-            wanted: The schedule of a run that had this length from its start.
+            wanted: The schedule of a run that had the new length from its start.
             step: The step that the run has reached.
         """
         count = self.counted(step)
@@ -382,12 +385,12 @@ class Schedule:
         return min(maximum, self.sh_from + more)
 
     def densifies(self, step: int) -> bool:
-        """Return True if density control edits the primitives after this step."""
+        """Return True if density control makes an edit after this step."""
         edit = self.next_edit(self.counted(step - 1))
         return edit <= self.counted(step) and edit < self.densify_until
 
     def collects(self, step: int) -> bool:
-        """Return True if the densification statistics of this step are still needed."""
+        """Return True if a later edit uses the densification statistics of this step."""
         return self.counted(step - 1) + 1 < self.densify_until
 
     def prunes_large(self, step: int) -> bool:
@@ -407,7 +410,7 @@ class Schedule:
 
 
 def _with_edits_ahead(schedule: Schedule, wanted: Schedule, step: int) -> Schedule:
-    """Return the schedule with the edits of `wanted` in place of all edits after `step`."""
+    """Return the schedule with all edits after `step` planned as in `wanted`."""
     now = schedule.counted(step)
     done = schedule.edits_before + schedule.edits() - schedule.edits(step)
     missing = max(0, schedule.min_refinements - done)
@@ -418,7 +421,8 @@ def _with_edits_ahead(schedule: Schedule, wanted: Schedule, step: int) -> Schedu
         start = wanted.densify_from if wanted.next_edit(0) > now else now
     needed = start + missing * every + 1
     if missing and needed > until:
-        # A run that becomes far shorter than planned still makes its edits.
+        # Move the end of the edits later, so that a run that becomes far shorter than planned still
+        # makes the missing edits.
         until = max(until, min(needed, (now + schedule.counted(schedule.total)) // 2))
         every = max(LEAST_INTERVAL, (until - 1 - start) // missing)
     return replace(
@@ -437,8 +441,8 @@ def _fitted(start: int, last: int, every: int, photos: int, edits: int) -> tuple
         start: Wanted start.
         last: Largest allowed count of the last edit.
         every: Wanted interval.
-        photos: Number of training photos. The interval is at least this long if `edits` edits still
-            fit.
+        photos: Number of training photos. The interval is at least this number if `edits` edits
+            still fit.
         edits: Wanted number of edits.
     """
     wanted = start + edits * every
@@ -452,7 +456,7 @@ def _fitted(start: int, last: int, every: int, photos: int, edits: int) -> tuple
 
 @dataclass(frozen=True)
 class Phase:
-    """The phase in which a backbone decodes: step, schedule, training or evaluation."""
+    """The step, the schedule, and whether a backbone decodes for training or for evaluation."""
 
     step: int
     training: bool
@@ -465,10 +469,10 @@ class Phase:
 
 
 def shortness(views: float) -> float:
-    """Return 1 for runs of up to `SHORT` views, 0 from the published length on.
+    """Return the shortness of a run: 1 up to `SHORT` views, 0 from the published length on.
 
-    In between, the value falls with the logarithm of the length. Settings for short runs lose their
-    effect gradually as this value falls.
+    Between these two lengths, the shortness falls linearly with the logarithm of the length. The
+    effect of settings for short runs decreases with the shortness.
     """
     short = log(REFERENCE / max(1.0, views)) / log(REFERENCE / SHORT)
     return min(1.0, max(0.0, short))

@@ -1,8 +1,8 @@
 """Screen statistics of a rendered view at any scale, per Gaussian and per primitive.
 
-All values are in units of the full photo. Gradients are with respect to NDC coordinates, radii are
-divided by the longer image side, and pixel counts refer to the photo as trained. A loss is a mean
-over pixels, so its gradients need no factor for the number of pixels.
+All values are in units of the full photo. Gradients are with respect to NDC coordinates. Radii are
+divided by the longer image side. Pixel counts refer to the photo at training resolution. Gradients
+need no factor for the number of pixels, because a loss is a mean over pixels.
 """
 
 from collections.abc import Mapping, Sequence
@@ -46,8 +46,9 @@ def _of_rows(record: RenderedView, statistic: Tensor | None, rows: Tensor | None
 def directions(record: RenderedView) -> Tensor:
     """Return `Screen.directions` as [6, 5, N], with its absolute gradients converted to NDC.
 
-    The dimensions are bins, fields, Gaussians. With the Gaussians last, sums over bins are sums of
-    whole rows, which is much faster on the CPU.
+    The dimensions are the 6 bins, the 5 numbers of each bin, and the Gaussians. With the Gaussians
+    in the last dimension, sums over bins are sums of whole rows. Sums of whole rows are much faster
+    on the CPU.
     """
     per_pixel = _present(record.screen.directions)
     bins = per_pixel.permute(1, 2, 0).clone(memory_format=torch.contiguous_format)
@@ -56,7 +57,7 @@ def directions(record: RenderedView) -> Tensor:
 
 
 def pixels(record: RenderedView) -> Tensor:
-    """Return [N], the pixels of the full photo in which the Gaussian was blended (float)."""
+    """Return [N], the number of the full photo's pixels in which a Gaussian was blended (float)."""
     return of_photo(record, _present(record.screen.pixels))
 
 
@@ -85,8 +86,8 @@ def visible(record: RenderedView, rows: Tensor | None = None) -> Tensor:
 def seen(record: RenderedView) -> Tensor | None:
     """Return [S] int64 rows of the Gaussians that touched a pixel; sums need only these rows.
 
-    On a GPU, return None, which means all rows, because the host would have to wait for the number
-    of rows.
+    On a GPU, return None, which means all rows, because a list of rows would make the host wait for
+    the GPU.
     """
     radii, rows = record.screen.radii, record.screen.rows
     if not radii.is_cpu:
@@ -94,7 +95,7 @@ def seen(record: RenderedView) -> Tensor | None:
     if rows is None:
         return radii.nonzero()[:, 0]
     drawn = radii.index_select(0, rows) > 0
-    # In most cases, all listed rows touch a pixel.
+    # Avoid a copy if all listed Gaussians touch a pixel, which is the usual case.
     return rows if bool(drawn.all()) else rows.masked_select(drawn)
 
 
@@ -117,7 +118,7 @@ def sums(context: DensifyContext, state: PluginState, names: Sequence[str]) -> d
 
 
 def add(record: RenderedView, total: Tensor, values: Tensor, rows: Tensor | None = None) -> None:
-    """Add the value of each Gaussian, [N] or only those in `rows`, to its primitive's sum [P]."""
+    """Add the values [N] of all Gaussians, or of those in `rows`, to the primitives' sums [P]."""
     origin = record.gaussians.origin
     if origin is not None:
         total.index_add_(0, origin if rows is None else origin.index_select(0, rows), values)

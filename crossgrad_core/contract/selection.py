@@ -23,7 +23,7 @@ from crossgrad_core.contract.slots.sampler import Sampler
 
 @dataclass(frozen=True)
 class Selection:
-    """The chosen components of a run, for checking whether the components work together.
+    """The chosen components of a run and further choices that affect whether they work together.
 
     Attributes:
         backbone: The backbone.
@@ -32,19 +32,19 @@ class Selection:
         densifier: The densifier.
         rasterizer: The rasterizer.
         loss: The photometric loss.
-        exposure: The exposure, which models how a camera changes light.
-        initializer: The initializer, which adds points at the start.
+        exposure: The exposure, which models the brightness and colour response of a camera.
+        initializer: The initializer, which adds points to the scene at the start.
         resolution: The resolution, which chooses the scale of each view of a step.
         exporter: The exporter, which writes the trained scene to a file.
         metrics: The metrics of held-out views, by name.
         rules: The rules that act during training, by name.
         names: Slot (singular word, `reader` included) -> name under which the component was chosen.
-        views_per_step: K; the largest K if it changes.
+        views_per_step: Number of views per step, K; the largest number if K changes.
         device: Torch device type.
         grouping: The grouping; None if the run has no grouping.
-        labels: Labels that the grouping gives to training views; None if they are not known yet, or
-            without a grouping.
-        view_plan: K over the run; None if K is always `views_per_step`.
+        labels: Labels that the grouping gives to training views; None if the labels are not known
+            yet or the run has no grouping.
+        view_plan: Values of K over the run; None if K is always `views_per_step`.
     """
 
     backbone: Backbone
@@ -73,7 +73,7 @@ class Selection:
 
     @property
     def components(self) -> dict[str, Component]:
-        """The mapping slot (singular word) -> component, for the slots that are filled."""
+        """Slot (singular word) -> component, for the slots that have a component."""
         filled: dict[str, Component | None] = {
             "backbone": self.backbone,
             "sampler": self.sampler,

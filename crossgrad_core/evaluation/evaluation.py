@@ -1,8 +1,7 @@
 """Evaluation of held-out views: metrics of each view, means overall and per regime, and PSNR.
 
-Both images are clamped to [0, 1] and rounded to 8 bits per channel before the comparison, as if the
-render had been written to a file and read back. Masked pixels do not count. Metrics are means over
-images.
+Before the comparison, the render and the photo are clamped to [0, 1] and rounded to 8 bits per
+channel, as in image files. Masked pixels do not count. Metrics are means over images.
 
 Source: 3DGS evaluation scripts.
 """
@@ -20,10 +19,10 @@ from crossgrad_core.contract.slots.metric import Compared, Metric
 from crossgrad_core.evaluation.result import EvaluationResult, ViewMetrics, summarised
 
 #: PSNR of identical images, in dB. The value is finite, because JSON has no infinity and the mean
-#: over views must stay finite. Different images reach it only if fewer than one value in 150,000
-#: differs, by one 8-bit step.
+#: over views must stay finite. Two different images reach this limit only if less than one value in
+#: 150,000 differs by one 8-bit step.
 PSNR_LIMIT = 100.0
-#: Number of pixels whose differences stay in the cache until they are summed.
+#: Number of pixels that are compared at once, so that their differences fit into the CPU cache.
 _AT_ONCE = 2**15
 
 
@@ -65,7 +64,7 @@ def evaluate(
 
 
 def compare(view: View, render: Tensor, points: NDArray[np.float64] | None = None) -> Compared:
-    """Return a view's photo and render [H, W, 3], rounded to 8 bits, and the points it observed."""
+    """Return the data of a view that metrics compare; the render [H, W, 3] is rounded to 8 bits."""
     photo, mask = view.photo.image(), view.photo.mask()
     seen = np.zeros((0, 3)) if points is None else points[view.seen]
     return Compared(view, to_uint8(render), photo, mask, render.detach().cpu(), seen)
@@ -85,7 +84,7 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | N
 
     Args:
         image: [H, W, 3] in [0, 1], or uint8.
-        target: [H, W, 3] the other image, in the same form.
+        target: [H, W, 3] the photo, in the same form as `image`.
         mask: [H, W] bool, True where the pixel counts; None counts all pixels.
 
     Returns: At most `PSNR_LIMIT`; None if no pixel counts.
@@ -98,7 +97,8 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | N
     )
     if rendered.numel() == 0:
         return None
-    # Squares and sums are whole numbers, which float32 and float64 represent exactly.
+    # This sum is exact, because squares and sums are whole numbers that float32 and float64 can
+    # represent.
     total = 0.0
     for ours, theirs in zip(
         *(torch.split(pixels, _AT_ONCE) for pixels in (rendered, photo)), strict=True

@@ -1,4 +1,7 @@
-"""Results of an evaluation: metrics per view, means overall and per regime. Imports no torch."""
+"""Results of an evaluation: metrics of each view, and means overall and per regime.
+
+This module does not import torch.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -32,7 +35,7 @@ class ViewMetrics:
 
 @dataclass(frozen=True)
 class Means:
-    """Means over `views` views, fully masked views excluded; None if no view has the metric."""
+    """Mean metrics of `views` views (fully masked views excluded); None if no view has a value."""
 
     views: int
     values: Mapping[str, float | None]
@@ -50,11 +53,11 @@ class EvaluationResult:
     """The results of an evaluation.
 
     Attributes:
-        figures: The measured metrics, in the order of all tables.
+        figures: The measured metrics, in their order in all tables.
         views: Metrics of each view, in the order of the scene.
         overall: Means over all views.
         regimes: Regime -> means over its views, sorted by name.
-        reasons: Name of a metric -> reason why it is null.
+        reasons: Name of a metric -> reason why the metric is null.
     """
 
     figures: tuple[Figure, ...]

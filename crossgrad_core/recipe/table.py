@@ -15,7 +15,7 @@ from crossgrad_core.registry.slots import GROUPS
 from crossgrad_core.registry.validation import as_user_error
 from crossgrad_core.wording import listed, plural
 
-#: Settings that training and assembly need and that have no default: a recipe decides each of them.
+#: Settings that every run needs and that have no default. A recipe decides each of these settings.
 DECIDED: Final = (
     *(
         "views_per_step",
@@ -28,8 +28,8 @@ DECIDED: Final = (
     *("position_lr", "rate_factor", "few_pass_rates", "beta1", "beta2", "step_order"),
     *("eval_every", "save_every"),
 )
-#: First part of the names of rows for rules. The row `rules.NAME` contains the options of the rule,
-#: or False if the rule is not used.
+#: First part of the names of settings for rules. The row `rules.NAME` contains the options of the
+#: rule, or False if the rule is not used.
 RULES: Final = "rules"
 #: Maximum number of decision lines in the terminal.
 LINES: Final = 12
@@ -68,7 +68,7 @@ def is_complete(config: RunConfig) -> bool:
 
 
 def decide(config: RunConfig, facts: Facts) -> tuple[Decision, ...]:
-    """Return the rows of the recipe for the settings without a value.
+    """Return the recipe's decisions on the settings that have no value yet.
 
     Raises:
         UserError: The recipe does not decide a setting that a run needs.
@@ -128,7 +128,7 @@ def _settings_of(config: RunConfig, name: str) -> dict[str, Any]:
 
 
 def _long_form(name: str, value: object) -> object:
-    """Return the value; a component's name becomes a mapping with this name."""
+    """Return the value of a setting; the name of a component becomes a mapping with this name."""
     component = plural(name) in GROUPS
     return {"name": value} if component and isinstance(value, str) else value
 
@@ -154,8 +154,8 @@ def without_decided(settings: dict[str, Any]) -> None:
 def rows_of(config: RunConfig) -> tuple[Decision, ...]:
     """Return the decisions recorded in a configuration, without their evidence."""
     values = ((name, _value(config, name), why) for name, why in config.decided.items())
-    # The limit on views of a run with a time budget has already been converted to a number of
-    # steps.
+    # Leave out settings without a value. For example, a run with a time budget has converted its
+    # limit on views to a number of steps.
     return tuple(Decision(*row) for row in values if row[1] is not None)
 
 
@@ -170,7 +170,7 @@ def _value(config: RunConfig, setting: str) -> object:
 
 
 def short_lines(rows: Iterable[Decision]) -> tuple[str, ...]:
-    """Return one line for each decision that differs from the published value, `LINES` at most."""
+    """Return at most `LINES` lines, one for each decision that differs from the published value."""
     shown = [f"{_value_text(row)}: {row.because} ({row.override})" for row in rows if row.override]
     left = len(shown) - LINES
     if left > 0:
@@ -188,7 +188,7 @@ def full_lines(rows: Iterable[Decision]) -> tuple[str, ...]:
 
 
 def table_lines(rows: Sequence[Decision]) -> tuple[str, ...]:
-    """Return the table in columns: setting, value, reason."""
+    """Return the lines of the table with the columns setting, value and reason."""
     names = max((len(row.setting) for row in rows), default=0)
     values = max((len(shown(row.value)) for row in rows), default=0)
     return tuple(

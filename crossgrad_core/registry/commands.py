@@ -1,4 +1,4 @@
-"""Commands by name: they are described without an import and imported when they are called."""
+"""Commands of plugins: the help describes them without an import, and a call imports them."""
 
 import ast
 import inspect
@@ -17,7 +17,7 @@ from crossgrad_core.system.command_options import GroupedCommand
 if TYPE_CHECKING:
     from typer import _click as click
 
-#: The object that an entry point in the group `crossgrad.commands` names.
+#: Type of the object at an entry point of the group `crossgrad.commands`.
 Command: TypeAlias = "typer.Typer | Callable[..., Any]"
 
 
@@ -25,7 +25,8 @@ def load_command(entry: Entry) -> Command:
     """Return the typer app or function that an entry point names; its module is imported first.
 
     Raises:
-        UserError: The object cannot be imported, or it is another kind of object.
+        UserError: The object cannot be imported, or the object is neither a typer app nor a
+            function.
     """
     command = resolve_entry(entry)
     if isinstance(command, typer.Typer) or inspect.isfunction(command):
@@ -40,7 +41,7 @@ def load_command(entry: Entry) -> Command:
 
 
 def as_group_member(command: Command, name: str) -> "click.Command":
-    """Return the command in the form in which `crossgrad` calls it.
+    """Return the command of a plugin as a click command.
 
     Args:
         command: A typer app, or a function; the help groups the options of a function.
@@ -56,7 +57,8 @@ def as_group_member(command: Command, name: str) -> "click.Command":
 def summary(entry: Entry) -> str:
     """Return the first line of a command's docstring, or of its module's docstring.
 
-    The source is read, not run. Without a source or a docstring, the line names the package.
+    The source file is read but not executed. Without a source file or a docstring, return a line
+    that names the package.
     """
     module, _, name = entry.value.partition(":")
     try:
@@ -73,7 +75,7 @@ def _source(module: str) -> bytes:
     """Return the source of a module; unlike `importlib.util.find_spec`, import no parent package.
 
     Raises:
-        FileNotFoundError: There is no such module.
+        FileNotFoundError: The module does not exist.
     """
     parts = module.split(".")
     path: list[str] | None = None

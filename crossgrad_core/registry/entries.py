@@ -1,8 +1,8 @@
 """Plugins by name: listed from package metadata, imported only when a run needs them.
 
 Listing reads entry points and imports no plugin, no torch and no pydantic. Loading never fails
-silently. It raises an error if a name is unknown, if two distributions offer the name, if the
-plugin fails to import, or if the plugin has the wrong kind. The error names the plugin and its
+silently. Loading raises an error if a name is unknown, if two distributions offer the name, if the
+plugin cannot be imported, or if the plugin has a wrong type. The error names the plugin and its
 distribution.
 """
 
@@ -43,7 +43,7 @@ OURS: Final = "crossgrad"
 
 @dataclass(frozen=True)
 class Entry:
-    """One plugin as its distribution announces it.
+    """An installed plugin, as described by the entry point in its distribution.
 
     Attributes:
         name: The name that users type.
@@ -76,10 +76,10 @@ class Entry:
 
 
 def offers(slot: str) -> tuple[Entry, ...]:
-    """Return all entries of installed distributions for a slot, by name; names may occur twice.
+    """Return all installed entries of a slot, sorted by name; a name may occur twice.
 
     Raises:
-        KeyError: There is no such slot.
+        KeyError: The slot does not exist.
     """
     return _offers(tuple(sys.path))[slot]
 
@@ -88,16 +88,16 @@ def entries(slot: str) -> dict[str, Entry]:
     """Return name -> entry for a slot. No plugin is imported.
 
     Raises:
-        KeyError: There is no such slot.
+        KeyError: The slot does not exist.
     """
     return {entry.name: entry for entry in offers(slot)}
 
 
 def find(slot: str, name: str) -> Entry:
-    """Return the only entry of that name.
+    """Return the only entry of a slot with the name `name`.
 
     Raises:
-        UserError: No distribution offers the name, or more than one does.
+        UserError: No distribution offers the name, or several distributions offer it.
     """
     named = [entry for entry in offers(slot) if entry.name == name]
     if not named:
@@ -110,8 +110,8 @@ def find(slot: str, name: str) -> Entry:
             where=singular(slot),
             expected="one package per name",
             found=listed(f"{entry.distribution} {entry.version}" for entry in named),
-            todo=f"rename it in {listed(others)}, or uninstall that package: the name belongs "
-            "to crossgrad"
+            todo=f"rename the plugin in {listed(others)}, or uninstall that package: the name "
+            "belongs to crossgrad"
             if ours
             else "uninstall all of these packages except one",
         )
@@ -123,15 +123,17 @@ def load(slot: "type[C]", name: str) -> "type[C]": ...
 @overload
 def load(slot: str, name: str) -> "type[Component]": ...
 def load(slot: "str | type[Component]", name: str) -> "type[Component]":
-    """Return the class that fills a slot under a name; its module is imported first.
+    """Return the class of the component with this name; its module is imported first.
 
     Args:
-        slot: Name of the slot, or its base class; the returned class is a subclass of it.
+        slot: Name of the slot, or base class of the slot; the returned class is a subclass of this
+            base class.
         name: Name of the plugin.
 
     Raises:
-        UserError: The name is unknown or ambiguous; the plugin fails to import; the plugin is not a
-            complete subclass of the slot's base class; or its methods take other arguments.
+        UserError: The name is unknown or ambiguous, or the plugin cannot be imported. Also if the
+            plugin is not a complete subclass of the slot's base class, or if its methods take other
+            arguments.
     """
     return load_entry(find(slot if isinstance(slot, str) else slot.slot, name))
 
@@ -190,10 +192,11 @@ def notes_on(error: BaseException) -> list[str]:
 
 
 def quick_answer(entry: Entry) -> Callable[[Any], Any] | None:
-    """Return a function that answers for a component without importing its class; or None.
+    """Return a function that replaces a component's method and imports no component; or None.
 
-    A package may announce such a function under the name of its component. The function answers
-    like `accepts` of a reader with default options, or like `speed` of a rasterizer.
+    A package may define such a function in an entry point with the name of the component. The
+    function returns the same result as `accepts` of a reader with default options, or as `speed` of
+    a rasterizer.
 
     Raises:
         UserError: The function cannot be imported.
@@ -205,7 +208,7 @@ def quick_answer(entry: Entry) -> Callable[[Any], Any] | None:
 
 
 def failed_plugin(error: Exception) -> UserError | None:
-    """Return the error for an exception from another package; None for crossgrad's own code."""
+    """Return a user error for an exception that a plugin of another package raised; else None."""
     others = (entry for slot in OFFERED for entry in offers(slot) if entry.distribution != OURS)
     raising = [(entry, line) for entry in others if (line := raised_at(error, entry.package))]
     if not raising:
@@ -245,7 +248,8 @@ def build(slot: "str | type[Component]", name: str, options: Mapping[str, Any]) 
     """Return the component of that name with validated options.
 
     Args:
-        slot: Name of the slot, or its base class; the returned component is an instance of it.
+        slot: Name of the slot, or base class of the slot; the returned component is an instance of
+            this class.
         name: Name of the plugin.
         options: Name of an option -> value.
 
@@ -297,7 +301,7 @@ def plain(component: "Component") -> dict[str, Any]:
 
 @cache
 def _offers(path: tuple[str, ...]) -> dict[str, tuple[Entry, ...]]:  # noqa: ARG001 - cache key
-    """Return slot -> entries; the argument is `sys.path`, so that a new path is scanned again."""
+    """Return slot -> entries; the argument is `sys.path`, so a changed path causes a new scan."""
     from importlib.metadata import entry_points
 
     # Call `entry_points` once and without a filter, because each call scans every installed
@@ -321,7 +325,7 @@ def _offers(path: tuple[str, ...]) -> dict[str, tuple[Entry, ...]]:  # noqa: ARG
 
 @cache
 def _identity(distribution: "Distribution | None") -> tuple[str, str]:
-    """Return name and version; cached, because each access parses the metadata file."""
+    """Return the name and version of a distribution; cached, because each access parses a file."""
     if distribution is None:
         return "unknown", "unknown"
     metadata = distribution.metadata

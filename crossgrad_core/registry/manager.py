@@ -1,7 +1,8 @@
 """One plugin manager per run, and calls of first-result hooks, which must return a result.
 
-pluggy does not report an unknown hook, a hook method without its marker, or a second plugin that
-answers a first-result hook. In this module all three are errors that name the plugin.
+The library pluggy does not report an unknown hook, a hook method without its marker, or a second
+plugin that answers a first-result hook. This module reports these three mistakes as errors that
+name the plugin.
 """
 
 import inspect
@@ -39,8 +40,8 @@ _MARK = f"{PROJECT}_impl"
 class _Manager(pluggy.PluginManager):
     """A manager that passes to pluggy only the attributes that can be hooks.
 
-    A component has a hundred attributes. If pluggy examined all of them, every start would take 0.3
-    s longer.
+    A component has about a hundred attributes. If pluggy examined all attributes, every start would
+    take 0.3 s longer.
     """
 
     def __init__(self, project: str) -> None:
@@ -49,7 +50,8 @@ class _Manager(pluggy.PluginManager):
 
     @override
     def parse_hookimpl_opts(self, plugin: object, name: str) -> Any:
-        # pluggy reads all methods of a plugin before it reads the next plugin.
+        # Store the names of one plugin only, because pluggy reads all methods of a plugin before
+        # the next plugin.
         if self._asked[0] is not plugin:
             self._asked = plugin, _may_be_hooks(plugin)
         return super().parse_hookimpl_opts(plugin, name) if name in self._asked[1] else None
@@ -59,11 +61,12 @@ def make_manager(plugins: Mapping[str, object]) -> pluggy.PluginManager:
     """Return a new manager with the hooks and the given plugins registered.
 
     Args:
-        plugins: Name -> plugin. If two plugins wrap one hook, the later one is the outer wrapper.
+        plugins: Name -> plugin. If two plugins wrap one hook, the later plugin is the outer
+            wrapper.
 
     Raises:
         UserError: A plugin has a hook that does not exist, a hook method without `@hookimpl`, or a
-            hook method with wrong arguments; or two plugins answer the same first-result hook.
+            hook method with wrong arguments. Also if two plugins answer the same first-result hook.
     """
     manager = _Manager(PROJECT)
     manager.add_hookspecs(HookSpecs)
@@ -84,7 +87,7 @@ def make_manager(plugins: Mapping[str, object]) -> pluggy.PluginManager:
 
 
 def call_first_result(hook: pluggy.HookCaller, context: StepContext, answer: type[A]) -> A:
-    """Call a first-result hook and return its answer, checked.
+    """Call a first-result hook and return its answer, after a check of the answer's type.
 
     Args:
         hook: A hook that stops at the first answer, such as `manager.hook.crossgrad_densify`.
@@ -108,7 +111,7 @@ def call_first_result(hook: pluggy.HookCaller, context: StepContext, answer: typ
 
 
 def call_all(hook: pluggy.HookCaller, context: StepContext, answer: type[A]) -> list[A]:
-    """Call a hook that several plugins answer and return all answers, checked.
+    """Call a hook that several plugins answer and return all answers, after a check of their types.
 
     Args:
         hook: A hook that all plugins answer, such as `manager.hook.crossgrad_after_step`.
@@ -132,7 +135,7 @@ def wrong_answer(hook: pluggy.HookCaller, expected: str, found: str) -> UserErro
         where=f"one of {listed(impl.plugin_name for impl in hook.get_hookimpls())}",
         expected=expected,
         found=found,
-        todo="repair the plugin (docs/hooks.md), or run without it",
+        todo="repair the plugin (docs/hooks.md), or run without this plugin",
     )
 
 
@@ -140,7 +143,7 @@ def one_by_one(manager: pluggy.PluginManager, name: str) -> tuple[pluggy.HookCal
     """Return a caller for each plugin that answers a hook, in the order of registration.
 
     Each caller calls one plugin, so that the next plugin can receive the answer of the previous
-    one. Wrappers take part in every call.
+    plugin. Every call also runs the wrappers of the hook.
     """
     answering = [
         implementation.plugin
@@ -164,7 +167,7 @@ def _note_failures(manager: pluggy.PluginManager, name: str, plugin: object) -> 
 
 
 def _noted(function: Callable[..., Any], note: str) -> Callable[..., Any]:
-    """Return the function (it may be a wrapper) with the note added to the exceptions it raises."""
+    """Return a function or generator function that adds the note to the function's exceptions."""
 
     def call(*arguments: object) -> object:
         try:
@@ -184,7 +187,8 @@ def _noted(function: Callable[..., Any], note: str) -> Callable[..., Any]:
 
 
 def _add_note(error: BaseException, note: str) -> None:
-    # An exception that a wrapper passes on comes from another plugin and already has a note.
+    # An exception that passed through a wrapper was raised by another plugin and already has a
+    # note.
     if not any(
         present_note.startswith("in hook ") for present_note in getattr(error, "__notes__", ())
     ):
@@ -230,7 +234,7 @@ def _refuse_misspelt_hooks(manager: pluggy.PluginManager, name: str, plugin: obj
 
 
 def _may_be_hooks(plugin: object) -> frozenset[str]:
-    """Return the attributes that are marked, or of a kind that only pluggy can classify."""
+    """Return the names of attributes that are marked as hooks, or that only pluggy can check."""
     if inspect.isclass(plugin) or inspect.ismodule(plugin):
         return frozenset(dir(plugin))
     attributes: dict[str, object] = {}
@@ -243,7 +247,7 @@ def _may_be_hooks(plugin: object) -> frozenset[str]:
 
 
 def _may_be_hook(attribute: object) -> bool:
-    """Return True if a class attribute is marked, or of a kind that only pluggy can classify."""
+    """Return True if a class attribute is marked as a hook, or if only pluggy can check it."""
     if isinstance(attribute, FunctionType):
         return hasattr(attribute, _MARK)
     if isinstance(attribute, staticmethod | classmethod | MethodType):
@@ -280,7 +284,7 @@ def _no_such_hook(name: str, plugin: object, hook: str) -> UserError:
 
 
 def _refuse_second_answers(manager: pluggy.PluginManager) -> None:
-    """Refuse two plugins that answer one hook: the later one would replace the other silently."""
+    """Refuse two plugins that answer one first-result hook; only one answer would be used."""
     for hook in _HOOKS:
         caller: pluggy.HookCaller = getattr(manager.hook, hook)
         spec = caller.spec

@@ -4,7 +4,7 @@ from typing import Final
 
 from crossgrad_core.system.version import VERSION
 
-#: The name of the distribution that packages require.
+#: Name of crossgrad in the requirements of packages.
 CROSSGRAD: Final = "crossgrad"
 
 
@@ -18,8 +18,8 @@ def unmet_requirement(distribution: str) -> str:
         lines = requires(distribution) or []
     except (PackageNotFoundError, ValueError):
         return ""
-    # Parse only requirements that begin with this name, because packages have many other
-    # requirements.
+    # Parse only requirements that begin with `crossgrad`, because parsing all requirements would
+    # take longer.
     return next(filter(None, map(_refusing, filter(_may_be_ours, lines))), "")
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 _POSITIONAL: Final = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
-#: The package that defines the methods that crossgrad calls.
+#: Prefix of the modules whose base classes define the methods that crossgrad calls.
 _CONTRACT: Final = "crossgrad_core.contract."
 
 
@@ -24,7 +24,7 @@ def wrong_signatures(found: type, base: type) -> tuple[tuple[str, str, str], ...
         found: A subclass of `base`.
         base: The base class of a slot.
 
-    Returns: Name, signature in the base class and actual signature, for each such method.
+    Returns: Name, signature in the base class and actual signature, for each wrong method.
     """
     contract = [ancestor for ancestor in base.__mro__ if ancestor.__module__.startswith(_CONTRACT)]
     names = dict.fromkeys(name for ancestor in contract for name in vars(ancestor))
@@ -34,8 +34,8 @@ def wrong_signatures(found: type, base: type) -> tuple[tuple[str, str, str], ...
         if name.startswith(("_", "crossgrad_")) or ours is theirs:
             continue
         if isfunction(theirs) and isfunction(ours):
-            # A decorator may pass its own arguments, so use the signature of the decorated
-            # function.
+            # Use the signature of the function that a decorator returned, because crossgrad calls
+            # this function.
             expected, given = signature(theirs), signature(ours, follow_wrapped=False)
             if not _takes(given, expected, whole=True) or not _takes(given, expected, whole=False):
                 wrong.append((name, str(expected), str(given)))
@@ -43,7 +43,7 @@ def wrong_signatures(found: type, base: type) -> tuple[tuple[str, str, str], ...
 
 
 def _takes(given: Signature, expected: Signature, *, whole: bool) -> bool:
-    """Return True if a call with all arguments, or with the required arguments, is possible."""
+    """Return True if a call with all (`whole`) or only the required arguments is possible."""
     passed = [p for p in expected.parameters.values() if whole or p.default is Parameter.empty]
     positional = [parameter for parameter in passed if parameter.kind in _POSITIONAL]
     named = {
@@ -57,7 +57,7 @@ def _takes(given: Signature, expected: Signature, *, whole: bool) -> bool:
 
 
 def raised_at(error: BaseException, package: str) -> str:
-    """Return the innermost line of a package that raised or passed an exception; else empty.
+    """Return the innermost source line of a package in the traceback of an exception; else empty.
 
     Args:
         error: The exception; the exceptions that caused it are searched as well.

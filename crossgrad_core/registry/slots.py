@@ -1,6 +1,6 @@
 """The slots that plugins fill, their entry-point groups, and entry points in unknown groups.
 
-This module imports nothing heavy.
+This module imports no large package.
 """
 
 from collections.abc import Iterator
@@ -33,22 +33,23 @@ GROUPS: Final[dict[str, str]] = {
 }
 #: Slots that a run fills with a list of components.
 LISTS: Final = ("metrics", "observers")
-#: Slots that a run fills with any number of components. The value of `rules` is a mapping of names.
+#: Slots that a run fills with any number of components. The setting `rules` is a mapping from names
+#: to options.
 MANY: Final = (*LISTS, "rules")
-#: The group of commands that packages add to `crossgrad`. It is not a slot of a run.
+#: The group of commands that packages add to `crossgrad`. This group is not a slot of a run.
 COMMANDS: Final = "commands"
-#: Everything that packages can offer -> entry-point group.
+#: Name of a slot, or `commands` -> entry-point group.
 OFFERED: Final[dict[str, str]] = {**GROUPS, COMMANDS: f"crossgrad.{COMMANDS}"}
-#: The group of planners, which decide settings of a run from its scene (`--plan`). It is not a slot
-#: of a run.
+#: The group of planners, which decide settings of a run from its scene (`--plan`). This group is
+#: not a slot of a run.
 PLANNERS: Final = "planners"
-#: Slot -> entry-point group of functions that answer for `auto` before a component is imported:
-#: `accepts` of a reader, `speed` of a rasterizer.
+#: Slot -> entry-point group of functions that `auto` calls without importing a component. The
+#: functions replace `accepts` of a reader and `speed` of a rasterizer.
 QUICK: Final = {
     "readers": "crossgrad.readers.accepts",
     "rasterizers": "crossgrad.rasterizers.speed",
 }
-#: The core's own commands. No plugin replaces them.
+#: The core's own commands. A plugin cannot replace these commands.
 OWN_COMMANDS: Final = ("run", "eval", "render", "export")
 _KNOWN: Final = (*OFFERED.values(), *QUICK.values(), f"crossgrad.{PLANNERS}")
 _PREFIX: Final = "crossgrad"
@@ -109,7 +110,7 @@ def _is_like_ours(group: str) -> bool:
 
 
 def _meant(group: str) -> str:
-    """Return the group that is probably meant: by its singular word, or by similar spelling."""
+    """Return the known group that an unknown group probably means; empty if none is similar."""
     from difflib import get_close_matches
 
     slot = plural(group.lower().removeprefix(_PREFIX).strip("._-:"))

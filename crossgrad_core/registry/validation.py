@@ -18,19 +18,19 @@ _PREFIXES = ("Input should be ", "Value error, ", "Assertion failed, ")
 def as_user_error(
     error: ValidationError, model: type[BaseModel], *, subject: str, prefix: str = "", todo: str
 ) -> UserError:
-    """Return a user error for the first validation error; it also names all other wrong options.
+    """Return a user error for the first wrong option; the error also names all other wrong options.
 
     Args:
         error: The error of pydantic.
         model: The validated model; its fields are the options that are suggested.
         subject: The owner of the options, for example `operator cagrad`.
-        prefix: The position of the options in a configuration, for example `operator`.
+        prefix: Key of the options in a configuration, for example `operator`.
         todo: Advice for the user.
     """
     details = error.errors(include_url=False)
     first, places = details[0], [_place(model, detail["loc"]) for detail in details]
     option_path, holder = places[0]
-    # A value that fits no branch of a union is reported once for each branch.
+    # Join the errors of one option, because pydantic reports one error for each branch of a union.
     branches = [detail for detail, at in zip(details, places, strict=True) if at[0] == option_path]
     key, *others = dict.fromkeys(".".join(parts) for parts, _ in places)
     more = f"also wrong: {listed(others)}" if others else ""
@@ -55,9 +55,9 @@ def as_user_error(
 def _place(
     model: type[BaseModel], location: _Location
 ) -> tuple[tuple[str, ...], type[BaseModel] | None]:
-    """Return the place in the input that a pydantic location names, and the model that holds it.
+    """Return the keys in a pydantic location, and the model that should contain the last key.
 
-    A location also names the tried branch of a union, which users never write.
+    The keys do not include the branches of a union, because the user's input does not contain them.
     """
     parts: list[str] = []
     holder: type[BaseModel] | None = None
@@ -94,7 +94,10 @@ def _name(annotation: object) -> str:
 
 
 def _inside(annotation: object, part: str) -> tuple[type[BaseModel] | None, object]:
-    """Return `annotation` if it is a model, else None, and the annotation of `part` inside it."""
+    """Return the model and the annotation of its field `part`.
+
+    For a list, a tuple or a mapping, return None and the annotation of the values.
+    """
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         field = annotation.model_fields.get(part)
         return annotation, field.annotation if field else None

@@ -21,11 +21,12 @@ def run(
     verbose: bool = False,
     **options: object,
 ) -> Run:
-    """Train a scene, evaluate and export it, into the same folder as `crossgrad run`.
+    """Train a scene, evaluate it and export it, as `crossgrad run` does.
 
     Args:
         scene: Scene folder; the bundled example scene by default.
-        config: YAML file with settings, such as the config.yaml of a run; `options` override it.
+        config: YAML file with settings, such as the config.yaml of a run; `options` override the
+            file.
         quiet: Show no progress.
         verbose: Show every decision and event.
         options: Named like the options of `crossgrad run` or like the keys of config.yaml:
@@ -40,7 +41,7 @@ def run(
 
     Raises:
         UserError: The input is invalid; nothing was written.
-        RunFailedError: Training failed; existing results are kept.
+        RunFailedError: Training failed; results that were already written are kept.
         KeyboardInterrupt: The user interrupted the run. In Python's main thread, this exception is
             raised after the current step, and the run can be resumed.
     """
@@ -59,7 +60,7 @@ def resume(
     verbose: bool = False,
     **options: object,
 ) -> Run:
-    """Continue a stopped run, bit for bit.
+    """Continue a stopped run; an uninterrupted run would have bitwise equal results.
 
     Args:
         folder: The run's folder.
@@ -72,7 +73,7 @@ def resume(
     Raises:
         UserError: The folder is not a run, the run is finished or in use, an option would change
             the training, or the scene or a package has changed.
-        RunFailedError: Training failed; existing results are kept.
+        RunFailedError: Training failed; results that were already written are kept.
         KeyboardInterrupt: See `run`.
     """
     settings = merged(None, options, ())
@@ -85,7 +86,7 @@ def resume(
 
 @contextmanager
 def _speaking(*, quiet: bool) -> Iterator[None]:
-    """Report the stages of the start in the same way as a command."""
+    """Report the stages of the start as the command `crossgrad run` does."""
     announce(quiet=quiet)
     try:
         yield
@@ -102,7 +103,7 @@ def _say_nothing(table: str, folder: Path, words: Sequence[str]) -> None:
 
 
 def _result(outcome: app.Outcome) -> Run:
-    """Return the run, or raise the exception that corresponds to its ending."""
+    """Return the run, or raise an exception if training failed or a signal stopped the run."""
     folder, ending = outcome.folder.resolve(), outcome.ending
     if ending.status == "failed":
         raise RunFailedError(folder, ending.error or "") from ending.cause

@@ -1,4 +1,4 @@
-"""A run from its settings to its results: a new run, or a resumed one."""
+"""A run from its settings to its results, for new and for resumed runs."""
 
 import logging
 import sys
@@ -77,7 +77,9 @@ from crossgrad_core.wording import listed, one_line
 
 
 def check_clock(config: RunConfig) -> None:
-    """Refuse a budget in CPU seconds on several threads or a GPU; call after setting the threads.
+    """Refuse a time budget in CPU seconds on several threads or on a GPU.
+
+    Call this function after the number of threads is set.
 
     Raises:
         UserError: CPU time would count waiting threads, or would miss the work of the GPU.
@@ -113,7 +115,7 @@ def bundled_scene() -> Path:
     """Return the folder of the bundled scene, in an installed package or in a checkout.
 
     Raises:
-        UserError: The scene is in neither of these folders.
+        UserError: Both folders are missing.
     """
     package = Path(__file__).resolve().parents[1]
     installed = package / "data" / "boruszyn"
@@ -155,8 +157,8 @@ class Outcome:
         return 0 if self.signal is None else exit_code(self.signal)
 
 
-#: Function that receives the results (table, folder and exit messages). It is called while signals
-#: are recorded but do not yet end the process.
+#: Function that receives the results (table, folder and exit messages). A run calls this function
+#: while signals are recorded but do not end the process.
 Tell = Callable[[str, Path, Sequence[str]], None]
 
 
@@ -177,8 +179,8 @@ def run(  # noqa: PLR0913 - one parameter per option of the command line
         resume: Folder of a stopped run to continue.
         dry_run: For a new run: check everything, print the resolved settings, train nothing.
         verbosity: -1 quiet, 0 normal, 1 verbose.
-        accept_scene: For a new run: train although the scene contradicts itself. For a resumed
-            run: continue although photos, masks or points of the scene have changed.
+        accept_scene: For a new run: train although points, poses and photos do not match. For a
+            resumed run: continue although photos, masks or points of the scene have changed.
         accept_plugins: Continue with other versions of the packages that train the run.
         check: Decode all photos before training.
 
@@ -197,7 +199,7 @@ def run(  # noqa: PLR0913 - one parameter per option of the command line
         raise UserError(
             "--accept-plugins has no effect on a new run",
             where="--accept-plugins",
-            todo="leave it out, or name a run to resume with --resume",
+            todo="leave --accept-plugins out, or name a run to resume with --resume",
         )
     if accept_scene:
         settings = layered([settings, {"data.accept_scene": True}])
@@ -208,7 +210,7 @@ def run(  # noqa: PLR0913 - one parameter per option of the command line
 
 
 def _end(outcome: "Outcome", way: "Way") -> int:
-    """Print the next commands of a complete run; return the exit code."""
+    """Print commands that the user may run next after a finished run; return the exit code."""
     if outcome.ending.status == "finished" and way.verbosity >= 0 and outcome.folder.is_dir():
         print("\n".join(next_lines(outcome.folder)))  # noqa: T201
     return outcome.exit_code
@@ -260,7 +262,7 @@ def new(settings: Mapping[str, Any], way: Way) -> Outcome:
 
 
 def _with_remarks(setup: Setup) -> tuple[Setup, float]:
-    """Return the setup with messages of exposure and initializer, and the time in seconds."""
+    """Return the setup with messages of exposure and initializer, and the time for the messages."""
     begun, scene = perf_counter(), setup.scene
     messages = setup.exposure.messages(scene, known_starts(setup))
     messages += setup.selection.initializer.messages(scene)
@@ -282,7 +284,7 @@ def _checked(settings: Mapping[str, Any], way: Way) -> tuple[Setup, float]:
 
 
 def with_defaults(config: RunConfig) -> RunConfig:
-    """Return the configuration with the scene filled in, and a length for the bundled scene."""
+    """Return the configuration with the bundled scene and its length if the user names no scene."""
     lengths = {"steps": config.steps, "views": config.max_views, "seconds": config.seconds}
     given = {unit: length for unit, length in lengths.items() if length is not None}
     if "steps" in given and len(given) > 1:
@@ -310,14 +312,14 @@ def with_defaults(config: RunConfig) -> RunConfig:
 
 @contextmanager
 def _tried_out() -> Iterator[None]:
-    """Turn an error in trial steps (kernels, planned length) into a message for the user.
+    """Convert an error in a trial step to a user error.
 
-    Nothing has been written yet.
+    Trial steps compile kernels and measure the time per step, before any file is written.
     """
     try:
         yield
-    # Numerical or memory problems can cause these errors. Any other error is a bug of crossgrad and
-    # keeps its traceback.
+    # Numerical or memory problems can cause errors of these types, so convert them to user errors.
+    # Any other error is a bug of crossgrad, so keep its traceback.
     except (TrainingFailedError, NonFiniteError, RuntimeError, ValueError, MemoryError) as error:
         if isinstance(error, UserError) or failed_plugin(error):
             raise
@@ -329,7 +331,7 @@ def _tried_out() -> Iterator[None]:
 
 
 def _within(setup: Setup, seconds: float) -> Setup:
-    """Return the setup with the length that fits into `seconds` of training."""
+    """Return the setup with the number of steps that fits into `seconds` of training."""
     steps, note, share = steps_for(setup, seconds)
     update = {"steps": steps, "seconds": None, "max_views": None, "revisions": ()}
     given = {"planned_seconds": seconds, "planned_views": setup.config.max_views}
@@ -360,7 +362,8 @@ def _new_folder(setup: Setup, state: TrainState) -> Iterator[Path]:
     needed = expected_bytes(state.primitives(setup), 2)
     folder = create_run_folder(name, setup.config.out, needed=needed)
     with _held(folder):
-        # Check again after taking the lock, because another run may have used the folder before.
+        # Check again after taking the lock, because another run may have written to the folder
+        # before the lock.
         check_out(folder)
         yield folder
 
@@ -370,8 +373,8 @@ def _held(folder: Path) -> Iterator[None]:
     with locked(folder, "training") as held:
         if not held:
             _LOG.warning(
-                "the file system of %s does not support locks, so that nothing prevents a "
-                "second process from writing to it",
+                "the file system of %s does not support locks, so a second process could write to "
+                "the same folder",
                 folder,
             )
         clear_half_written(folder)
@@ -418,7 +421,7 @@ def resumed(
     Args:
         folder: The run's folder.
         settings: Only `device`, `threads` and `stop_after` may differ from the run's own settings.
-        way: How the run reports to the user.
+        way: The form in which the run reports to the user.
         accept_scene: Continue although photos, masks or points of the scene have changed.
         accept_plugins: Continue with other versions of the packages that train the run.
 
@@ -427,7 +430,8 @@ def resumed(
             the training, or the scene or a package has changed.
     """
     accepted = {"accept_scene": accept_scene, "accept_plugins": accept_plugins}
-    # Check before taking the lock, because a folder of another kind must not be changed.
+    # Check the folder before taking the lock, because the lock would change a folder that is not a
+    # run.
     read_config(folder)
     with resume_hint(resume_line(folder)), _held(folder):
         setup, state = continued(folder, settings, way.verbosity, **accepted)
@@ -486,10 +490,11 @@ def _print_dry_run(setup: Setup) -> None:
 
 @contextmanager
 def as_in_a_command() -> Iterator[None]:
-    """Reset, inside the block, the global state of torch and numpy to that of a new process.
+    """Use the default global settings of torch and numpy inside the block.
 
-    Default type and device, `no_grad`, `inference_mode`, `np.errstate` and the number of threads
-    would change the bits of a run, or make it fail. The caller's state is restored afterwards.
+    The caller's default type, default device, `no_grad`, `inference_mode`, `np.errstate` or number
+    of threads would change the results of a run or make the run fail. After the block, the caller's
+    settings are restored.
     """
     threads = torch.get_num_threads(), numba.get_num_threads()
     kind, device = torch.get_default_dtype(), torch.get_default_device()

@@ -1,4 +1,4 @@
-"""From a configuration to a Setup: read the scene, select components, check, report omissions."""
+"""Build the `Setup` of a run: read the scene, select the components and check them."""
 
 import logging
 from collections.abc import Callable, Iterable, Mapping
@@ -44,8 +44,8 @@ from crossgrad_core.wording import in_one_line, listed, plural, singular
 def idle_note(setup: Setup) -> tuple[str, ...]:
     """Return a note if the operator leaves the gradient of a single view unchanged.
 
-    The note also suggests a remedy. There is no note for the default operator: its sum of one
-    gradient is the gradient, as expected.
+    The note also suggests a remedy. There is no note for the default operator, because users expect
+    that the sum of one gradient is this gradient.
     """
     selection = setup.selection
     name, views = selection.names["operator"], selection.views_per_step
@@ -72,7 +72,7 @@ def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
     """Return the scene and the name of the reader that read it.
 
     Raises:
-        UserError: No reader accepts the folder, several readers do, or the reader cannot read it.
+        UserError: No reader accepts the folder, several readers accept it, or the reader fails.
     """
     _LOG.info("reading scene %s", path)
     name = config.reader.name
@@ -85,7 +85,8 @@ def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
                 found=f"files for the readers {listed(able)}",
                 todo=f"choose a reader, such as --reader {able[0]}",
             )
-        # If no reader recognises the folder, one reader explains what is missing.
+        # If no reader accepts the folder, use one reader whose error message explains what is
+        # missing.
         near = (
             []
             if able
@@ -101,11 +102,11 @@ def read_and_check(config: RunConfig, path: Path, *, accept: bool = False) -> tu
     Args:
         config: The configuration.
         path: The scene's folder.
-        accept: True to continue although the scene contradicts itself; the configuration can also
-            set this.
+        accept: True to continue although points, poses and photos do not match. The setting
+            `data.accept_scene` has the same effect.
 
     Raises:
-        UserError: The scene contradicts itself; see also `read_scene`.
+        UserError: Points, poses and photos do not match; see also `read_scene`.
     """
     scene, name = read_scene(config, path)
     data = config.data
@@ -119,7 +120,7 @@ def accepts(name: str, path: Path) -> bool:
 
 
 def nearly_accepts(name: str, path: Path) -> bool:
-    """Return True if a file in the folder nearly has the format of a reader (see `accepts`)."""
+    """Return True if a file in the folder has almost the format of a reader (see `accepts`)."""
     return _answer(name, lambda: build(Reader, name, {}).nearly_accepts(path))
 
 
@@ -142,8 +143,8 @@ def check_names(config: RunConfig) -> None:
     """Look up every component and the device before a large scene is read.
 
     Raises:
-        UserError: A name does not exist (the message names the closest one), or its package
-            requires another version of crossgrad.
+        UserError: A name does not exist, or the package of a component requires another version of
+            crossgrad.
     """
     if config.device != AUTO:
         choose_device(config.device)
@@ -159,7 +160,7 @@ def check_names(config: RunConfig) -> None:
 
 
 def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
-    """Load everything that a configuration names, fit it to the scene and check it.
+    """Load all components of a configuration, fit them to the scene and check them.
 
     Args:
         config: The configuration.
@@ -203,7 +204,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
         decisions=decisions,
         decide=decide,
     )
-    # The length of a run with a time budget is not known yet.
+    # The length of a run with a time budget is planned later, so leave out the notes on the length.
     timed = notes_on_length(setup) if config.seconds is None else ()
     named = {plural(word): [name] for word, name in selection.names.items()}
     named["operators"] = [operator.name for operator in config.operators]
@@ -218,9 +219,10 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
 
 
 def _photos(config: RunConfig) -> ScaledPhotos | DevicePhotos:
-    """Return the cache of reduced photos, and on a GPU also the cache of photos in its memory."""
+    """Return the cache of reduced photos, and on a GPU also the cache of photos in GPU memory."""
     mib, device = config.data.cache_mib, choose_device(config.device)
-    # At half the size, photos use a quarter of the memory.
+    # Use a quarter of the limit, because photos of half the side length use a quarter of the
+    # memory.
     scaled = ScaledPhotos(mib // 4)
     return scaled if device.type == "cpu" else DevicePhotos(scaled, device, mib)
 
@@ -228,7 +230,7 @@ def _photos(config: RunConfig) -> ScaledPhotos | DevicePhotos:
 def _with_first_degree(config: RunConfig) -> RunConfig:
     """Return the configuration with the SH degree at which the run starts.
 
-    The degree is stored, so that a resumed run does not need the file from which it started.
+    The degree is stored, so that a resumed run does not need the PLY file of `--init`.
     """
     path = config.data.init_file
     if config.sh_from is not None or path is None:
@@ -240,8 +242,8 @@ def _with_first_degree(config: RunConfig) -> RunConfig:
 def _with_steps(config: RunConfig, views: ViewsPerStepSpec) -> RunConfig:
     """Return the configuration with a length in steps, unless its length is in seconds.
 
-    If a length in seconds and a limit in views are set, the limit is kept. The first steps show
-    whether the seconds suffice for the views.
+    If a length in seconds and a limit in views are set, the limit is kept. The first steps of the
+    run show whether the time is sufficient for all views.
 
     Raises:
         UserError: A single step renders more views than `max_views`.
@@ -292,7 +294,7 @@ def _plugins(selection: Selection, observers: Mapping[str, Component]) -> dict[s
 def reasons_against(
     config: RunConfig, selection: Selection, answers: Iterable[list[str]]
 ) -> tuple[str, ...]:
-    """Return the objections of the components and of the core to the selection."""
+    """Return the objections of the components and of the core to the selected components."""
     given = [[answer] if isinstance(answer, str) else answer for answer in answers]
     reasons = objections_to(selection) + [reason for answer in given for reason in answer]
     if config.backward == "joint" and selection.operator.separate:
@@ -307,7 +309,7 @@ def reasons_against(
 
 
 def refuse(reasons: tuple[str, ...]) -> None:
-    """Stop the start of a run if there are reasons against it.
+    """Raise an error if there are reasons against the selected components.
 
     Raises:
         IncompatibleSelectionError: `reasons` is not empty.
@@ -329,7 +331,7 @@ def _linear_note(setup: Setup) -> tuple[str, ...]:
         return (
             (
                 f"gradients of single views are stored for {', '.join(setup.watchers)} (the "
-                "result has the same bits)"
+                f"training result is bitwise equal)"
             ),
         )
     return (

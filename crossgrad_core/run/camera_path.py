@@ -20,17 +20,19 @@ from crossgrad_core.registry.validation import as_user_error
 from crossgrad_core.scene.raw import FARTHEST, FARTHEST_LOCAL
 from crossgrad_core.system.text_files import read_json
 
-#: The name of the built-in path: from the farthest photos to the nearest.
+#: Name of the built-in camera path from the farthest photos to the nearest photos.
 ZOOM: Final = "zoom"
 FRAMES_PER_SECOND: Final = 24.0
 #: Number of frames of a zoom path.
 FRAMES: Final = 120
-#: Views that observe fewer SfM points do not show reliably what they look at.
+#: Minimum number of SfM points that a view of a zoom path observes. With fewer points, the distance
+#: between the camera and the scene is unreliable.
 FEWEST_SEEN: Final = 8
-#: With more views than this, the ends of a zoom path are chosen from an even sample of this size.
+#: Maximum number of views from which the ends of a zoom path are chosen. If there are more views,
+#: every n-th view is used.
 MOST_VIEWS: Final = 500
 _TODO: Final = "write the file with nerfstudio's viewer, or as described in docs/runs.md"
-#: A camera path with more frames than this is refused, because it is probably a mistake.
+#: Maximum number of frames of a camera path. A longer path is probably a mistake.
 MOST_FRAMES: Final = 100_000
 _Floats = NDArray[np.float64]
 
@@ -40,7 +42,7 @@ class CameraPath:
     """Cameras in the local frame, one per frame.
 
     Attributes:
-        name: Part of the names of files.
+        name: Name of the path, which is a part of the names of output files.
         cameras: The cameras, one per frame.
         fps: Frames per second.
     """
@@ -55,7 +57,8 @@ def camera_path(scene: Scene, path: str, frames: int) -> CameraPath:
 
     Args:
         scene: The scene of the run.
-        path: `zoom`, or a camera path as nerfstudio's viewer writes it, in input coordinates.
+        path: `zoom`, or the file of a camera path in the format of nerfstudio's viewer, in input
+            coordinates.
         frames: Number of frames of a zoom path.
 
     Raises:
@@ -69,14 +72,15 @@ def camera_path(scene: Scene, path: str, frames: int) -> CameraPath:
 def zoom_path(views: Sequence[View], points: _Floats, frames: int) -> tuple[Camera, ...]:
     """Return cameras on a line from a far photo to a near photo of the same points.
 
-    The distance shrinks by the same factor in each frame. One end of the path is among the farthest
-    fifth of the views, the other end among the nearest fifth. The pair with the most common SfM
-    points is used; among equal pairs, the pair with the most similar viewing directions.
+    The distance to the points shrinks by the same factor in each frame. One end of the path is
+    among the farthest fifth of the views, the other end among the nearest fifth. The pair with the
+    most common SfM points is used; among equal pairs, the pair with the most similar viewing
+    directions.
 
     Args:
         views: The training views.
         points: [P, 3] SfM points.
-        frames: At least 2.
+        frames: Number of frames, at least 2.
 
     Raises:
         UserError: Fewer than two views observe enough SfM points.
@@ -121,14 +125,17 @@ def _ends(views: Sequence[View], distances: _Floats, points: int) -> tuple[int, 
 
 
 def _way(share: float, nearer: float) -> float:
-    """Return the position on the line (0 to 1) with `nearer ** share` times the first distance."""
+    """Return the position on the line of a zoom path, from 0 to 1.
+
+    At this position, the distance to the points is `nearer ** share` times the first distance.
+    """
     if abs(nearer - 1.0) < 1e-6:  # noqa: PLR2004 - the limit of the next formula
         return share
     return float((1.0 - nearer**share) / (1.0 - nearer))
 
 
 def _between(first: Camera, last: Camera, share: float, nearer: float) -> Camera:
-    """Return the camera at a share of the time; direction and field of view change evenly."""
+    """Return the camera after a share of all frames; direction and field of view change evenly."""
     ends = first.world_to_camera.numpy(), last.world_to_camera.numpy()
     down, ahead = ((1.0 - share) * ends[0][row, :3] + share * ends[1][row, :3] for row in (1, 2))
     forward = _unit(ahead)

@@ -35,7 +35,7 @@ from crossgrad_core.wording import showable
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """The complete state from which a run continues bit for bit.
+    """The complete state of a run, from which the run continues with bitwise equal results.
 
     Attributes:
         step: Number of completed steps.
@@ -45,7 +45,7 @@ class Checkpoint:
         adam_steps: Tensor name -> number of Adam steps taken.
         plugins: Plugin name -> state of the plugin.
         generators: Stream name -> `bit_generator.state` of its NumPy generator.
-        scalars: Counters, clocks and other values that JSON can hold (tuples come back as lists).
+        scalars: Counters, clocks and other values that JSON can store (tuples become lists).
     """
 
     step: int
@@ -71,7 +71,8 @@ class Keep:
 
     Attributes:
         last: Number of newest checkpoints that are kept, including the new one.
-        every: Checkpoints at multiples of this step are kept, too; None keeps none of them.
+        every: Checkpoints at multiples of this step are kept, too; None keeps only the newest
+            checkpoints.
     """
 
     last: int = 2
@@ -97,8 +98,8 @@ def named_checkpoints(folder: Path) -> dict[int, Path]:
     """Return step -> folder of the checkpoints in `folder`, in the order of steps.
 
     A checkpoint gets its final name when all of its files are written. A checkpoint with a missing
-    file is therefore damaged. Such a checkpoint is still returned, because otherwise an older
-    checkpoint would silently replace it.
+    file is therefore damaged. A damaged checkpoint is still returned, because otherwise a run would
+    silently continue from an older checkpoint.
     """
     if not folder.is_dir():
         return {}
@@ -108,14 +109,14 @@ def named_checkpoints(folder: Path) -> dict[int, Path]:
 
 
 def damaged(folder: Path, found: str) -> UserError:
-    """Return the error for a damaged checkpoint; it names another checkpoint if one exists."""
+    """Return the error for a damaged checkpoint; name a complete checkpoint if one exists."""
     named = named_checkpoints(folder.parent).values()
     others = [path for path in named if path.name != folder.name and is_complete(path)]
     return UserError(
         "the checkpoint is damaged",
         where=folder,
         found=found,
-        todo=f"remove it; the run then continues from {others[-1].name}"
+        todo=f"remove this folder; the run then continues from {others[-1].name}"
         if others
         else "start the run again",
     )
@@ -123,7 +124,7 @@ def damaged(folder: Path, found: str) -> UserError:
 
 @contextmanager
 def scratch_folder(final: Path) -> Iterator[Path]:
-    """Yield a folder to write into; it gets the name `final` if the block ends without an error."""
+    """Yield a temporary folder, which is renamed to `final` if the block ends without an error."""
     scratch = final.with_name(f"{_SCRATCH}{final.name}")
     final.parent.mkdir(parents=True, exist_ok=True)
     _clear(final.parent)
@@ -163,20 +164,20 @@ def _clear(folder: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
 
 
-#: Version of the layout. It is raised if an older reader could misread a newer checkpoint.
+#: Version of the file layout. Increase this number if older code could misread a newer checkpoint.
 FORMAT = 1
 _DIGEST = "state_sha256"
 
 
 def state_text(state: Mapping[str, Any]) -> str:
-    """Return the content of state.json: `state`, the versions that wrote it, and a digest."""
+    """Return the content of state.json: `state`, the format, the version and a digest."""
     rest = {key: value for key, value in state.items() if key != _DIGEST}
     whole = {"format": FORMAT, "crossgrad": VERSION, **rest}
     return json.dumps({_DIGEST: digest(whole), **whole}, indent=1)
 
 
 def digest(state: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a state without its `digest`, equal after a round trip through JSON."""
+    """Return the SHA-256 of a state without its digest; the state may come from a JSON file."""
     rest = {key: value for key, value in state.items() if key != _DIGEST}
     return sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
@@ -185,7 +186,7 @@ def check_json(value: object, where: str) -> None:
     """Refuse values that JSON would change: keys that are not text, tuples and arrays.
 
     Raises:
-        UserError: Such a value exists; the message names its position.
+        UserError: JSON would change a value; the message names the position of the value.
     """
     if wrong := no_json(value):
         raise UserError(
@@ -193,7 +194,7 @@ def check_json(value: object, where: str) -> None:
             where=where,
             expected="numbers, strings, lists, dictionaries with text keys, None",
             found=wrong,
-            todo="keep arrays as tensors in PluginState.tensors",
+            todo="store arrays as tensors in PluginState.tensors",
         )
 
 
@@ -223,7 +224,7 @@ def read_state(folder: Path) -> dict[str, Any]:
             where=folder,
             expected=f"version {FORMAT} (crossgrad {VERSION})",
             found=f"version {state['format']} (crossgrad {state.get('crossgrad', '?')})",
-            todo="resume with the version of crossgrad that wrote it",
+            todo="resume with the version of crossgrad that wrote the checkpoint",
         )
     _check_whole(state, folder)
     return state
@@ -289,7 +290,7 @@ def pack(checkpoint: "Checkpoint") -> dict[str, Tensor]:
         owned = tensor.detach().cpu().contiguous()
         storage = owned.untyped_storage()
         partial = storage.nbytes() != owned.numel() * owned.element_size()
-        # safetensors refuses tensors that share memory.
+        # Clone the tensor, because safetensors refuses tensors that share memory.
         if partial or storage.data_ptr() in storages:
             owned = owned.clone()
         storages.add(owned.untyped_storage().data_ptr())
@@ -306,7 +307,7 @@ def unpack(packed: Mapping[str, Tensor]) -> Unpacked:
     """Return the tensors by owner; the inverse of `pack`.
 
     Raises:
-        ValueError: `pack` cannot have made one of the keys.
+        ValueError: A key does not have the form of the keys that `pack` writes.
     """
     tensors = Unpacked()
     for key, tensor in packed.items():
@@ -329,8 +330,8 @@ def write_tensors(path: Path, packed: dict[str, Tensor]) -> None:
     """Write a safetensors file and wait until it is on the disk.
 
     Raises:
-        OSError: The system refused, for example because the disk is full. A system error that the
-            library wraps in its own exception is also raised as OSError.
+        OSError: The file cannot be written, for example because the disk is full. A system error
+            that the library wraps in its own exception is also raised as OSError.
     """
     from safetensors import SafetensorError
     from safetensors.torch import save_file
@@ -339,7 +340,7 @@ def write_tensors(path: Path, packed: dict[str, Tensor]) -> None:
         path.touch()
         mode = path.stat().st_mode
         save_file(packed, path)
-        # safetensors creates a new file that only its owner may read.
+        # Restore the permissions, because safetensors creates a file that only its owner may read.
         path.chmod(mode)
         sync_file(path)
     except SafetensorError as error:
@@ -359,7 +360,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     from safetensors.torch import load, load_file
 
     try:
-        # safetensors opens only files whose names are valid UTF-8.
+        # Read the bytes directly, because safetensors opens only files whose names are valid UTF-8.
         if showable(str(path)) != str(path):
             return load(path.read_bytes())
         # Clone the tensors, because safetensors maps the file and a later checkpoint may delete the
@@ -370,7 +371,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
 
 
 def _all(checkpoint: "Checkpoint") -> Iterator[tuple[tuple[str, ...], Tensor]]:
-    """Yield every tensor of a checkpoint with the path that names it."""
+    """Yield the key of every tensor of a checkpoint, as a tuple of names, and the tensor."""
     for kind in ("parameters", "exp_avg", "exp_avg_sq"):
         tensors: Mapping[str, Tensor] = getattr(checkpoint, kind)
         for name, tensor in tensors.items():
@@ -385,12 +386,12 @@ def _all(checkpoint: "Checkpoint") -> Iterator[tuple[tuple[str, ...], Tensor]]:
 def save(run: Path, checkpoint: Checkpoint, keep: Keep | None = None) -> Path:
     """Write a checkpoint below the run's folder, then delete the checkpoints that `keep` drops.
 
-    The new checkpoint gets its final name when all of it is on the disk. Until then, and after any
-    failure, the earlier checkpoints are not changed.
+    The new checkpoint gets its final name when all its files are on the disk. Until then, and after
+    any failure, the earlier checkpoints are not changed.
 
     Args:
         run: The run's folder.
-        checkpoint: The checkpoint; tensors on any device.
+        checkpoint: The checkpoint, with tensors on any device.
         keep: The rule for older checkpoints; by default the two newest checkpoints are kept.
 
     Returns:
@@ -410,7 +411,7 @@ def save(run: Path, checkpoint: Checkpoint, keep: Keep | None = None) -> Path:
             _write(final, tensors, state)
         except OSError as error:
             # The disk is full. Delete the checkpoints that are no longer kept, which may free
-            # enough space. The newest checkpoint stays.
+            # enough space. The newest checkpoint is kept.
             if not is_full(error) or not _drop(final.parent, keep, checkpoint.step):
                 raise
             _write(final, tensors, state)
@@ -427,7 +428,7 @@ def _write(final: Path, tensors: dict[str, Tensor], state: Mapping[str, Any]) ->
 
 
 def _drop(folder: Path, keep: Keep, *coming: int) -> bool:
-    """Delete the checkpoints that `keep` drops when checkpoints of the steps `coming` exist, too.
+    """Delete the checkpoints that `keep` drops; the steps `coming` count as existing checkpoints.
 
     Return True if a checkpoint was deleted.
     """
@@ -439,10 +440,10 @@ def _drop(folder: Path, keep: Keep, *coming: int) -> bool:
 
 
 def load_latest(run: Path) -> Checkpoint:
-    """Read the newest checkpoint of a run, even if the run deletes old checkpoints meanwhile.
+    """Read the newest checkpoint of a run, even if the run deletes checkpoints during the call.
 
     Raises:
-        UserError: There is no checkpoint, or it is damaged.
+        UserError: There is no checkpoint, or the newest checkpoint is damaged.
     """
     while True:
         folder = latest(run)
@@ -485,7 +486,7 @@ def drop_later(run: Path, step: int) -> None:
 
 
 def load(folder: Path) -> Checkpoint:
-    """Read a checkpoint folder: on the CPU, without gradients, bit for bit as it was saved.
+    """Return the checkpoint in a folder, with bitwise unchanged tensors on the CPU.
 
     Raises:
         UserError: The checkpoint is missing, incomplete, damaged, or of another format version.
@@ -497,7 +498,7 @@ def load(folder: Path) -> Checkpoint:
         raise damaged(folder, f"{TENSORS} has changed since it was written (its SHA-256 differs)")
     try:
         packed = read_tensors(folder / TENSORS)
-        # safetensors sorts the tensors by key, but the order of the parameters must stay the same.
+        # Restore the order of the parameters, because safetensors sorts the tensors by key.
         tensors = unpack({key: packed[key] for key in state["tensors"]})
         return Checkpoint(
             step=state["step"],

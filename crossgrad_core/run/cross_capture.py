@@ -17,18 +17,18 @@ from crossgrad_core.numerics.rotations import rotation_matrices
 from crossgrad_core.run.assemble import accepts, read_scene
 from crossgrad_core.training.setup import Setup
 
-#: A view counts as a training view if its pose is nearer to a training pose than these limits:
-#: local units (extents), and radians.
+#: Largest differences in position (local units) and in direction (radians) between a view and a
+#: training view. A view within both limits counts as this training view.
 SAME_PLACE, SAME_DIRECTION = 1e-3, 1e-2
-#: A capture is accepted if at least the first value, a share of its points, is inside a box. The
-#: box contains the run's points and cameras and is enlarged by the second value, a factor.
+#: Smallest share of a capture's points inside a box, and the factor that enlarges the box. The box
+#: contains the run's points and cameras.
 LEAST_SHARED, MARGIN = 0.1, 1.1
-#: Points of two captures of one place are on the same surfaces. Their median distance from the
-#: run's points is at most this share of the median after any of `TURNS` random rotations about the
-#: middle of the capture.
+#: Largest accepted ratio of two median distances of points, and number of random rotations. The
+#: points of two captures of one place are on the same surfaces. Therefore the capture's points are
+#: much nearer to the run's points than after a random rotation about the middle of the capture.
 LEAST_ALIKE, TURNS = 0.4, 9
-#: Minimum number of points for this test, maximum number of points from the other capture, and
-#: maximum number of points from the run.
+#: Minimum number of points for the test with random rotations, maximum number of points from the
+#: other capture, and maximum number of points from the run.
 FEWEST_POINTS, MOST_POINTS, MOST_OWN = 200, 2_000, 50_000
 
 
@@ -41,7 +41,8 @@ class Elsewhere:
         views: The views of the capture, except the views that the run was trained on.
         points: [P, 3] the SfM points of the capture.
         trained: Number of views of the capture that the run was trained on.
-        alike: True if the points are near the run's points, or if this is unknown.
+        alike: True if the points match the run's points, or if there are too few points for a
+            decision.
     """
 
     name: str
@@ -56,8 +57,8 @@ class Elsewhere:
         if not self.alike:
             messages.append(
                 "the points of this capture match the scene of the run hardly better than "
-                "after a random rotation: check the renders, and check that both show the "
-                "same place in the same coordinates"
+                "after a random rotation: check the renders, and check that the capture and the "
+                "run show the same place in the same coordinates"
             )
         if self.trained:
             messages.append(f"left out: {self.trained} views that the run was trained on")
@@ -69,7 +70,7 @@ def elsewhere(setup: Setup, path: Path) -> Elsewhere:
 
     Raises:
         UserError: The scene cannot be read or is in another place, or the run was trained on all
-            of its views.
+            views of the scene.
     """
     reading = {"split": "none", "masks": None, "init": "random", "points": None}
     config = setup.config.model_copy(
@@ -118,7 +119,8 @@ def _moved(camera: Camera, other: Scene, similarity: Similarity) -> Camera:
 def _are_trained(views: Sequence[View], trained: Sequence[View]) -> list[bool]:
     """Return for each view whether its pose is the pose of a training view."""
     centers, rotations = centers_of(trained), _rotations_of(trained)
-    # The trace of the rotation between two cameras decreases when the angle between them increases.
+    # Smallest trace of the rotation between two cameras with the same direction. The trace
+    # decreases when the angle between the cameras increases.
     least = 1.0 + 2.0 * math.cos(SAME_DIRECTION)
 
     def is_trained(center: NDArray[np.float64], rotation: NDArray[np.float64]) -> bool:
@@ -137,7 +139,7 @@ def _rotations_of(views: Sequence[View]) -> NDArray[np.float64]:
 def _check_place(
     scene: Scene, points: NDArray[np.float64], centers: NDArray[np.float64], path: Path
 ) -> None:
-    """Refuse a capture in other coordinates: its points are not where the run's scene is."""
+    """Refuse a capture whose points are outside the run's scene, because its coordinates differ."""
     scene_points = np.concatenate([scene.points, scene.robust_centers])
     middle, half = (
         (scene_points.max(axis=0) + scene_points.min(axis=0)) / 2,
@@ -150,13 +152,13 @@ def _check_place(
             "the other capture does not overlap with the scene of the run",
             where=f"--on {path}",
             expected="a capture of the same place, in the coordinate system of the run's scene",
-            found=f"{share:.0%} of its points are inside the run's scene",
+            found=f"{share:.0%} of the capture's points are inside the run's scene",
             todo="align the two models first, or estimate the poses of all photos together",
         )
 
 
 def _alike(run_points: NDArray[np.float64], points: NDArray[np.float64]) -> bool:
-    """Return True if `points` are near the run's points, and would not be after a rotation.
+    """Return True if `points` match the run's points better than after a random rotation.
 
     Also return True if there are too few points for a decision.
     """
@@ -184,5 +186,5 @@ def _alike(run_points: NDArray[np.float64], points: NDArray[np.float64]) -> bool
 
 
 def _some(points: NDArray[np.float64], most: int) -> NDArray[np.float64]:
-    """Return at most `most` points, evenly spread over their order."""
+    """Return at most `most` points: every n-th point."""
     return points[:: -(-len(points) // most)]

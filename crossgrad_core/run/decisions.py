@@ -30,8 +30,8 @@ from crossgrad_core.training.numbers import Numbers
 from crossgrad_core.training.setup import Setup
 
 _LOG = logging.getLogger(__name__)
-#: Function of a planner. It receives the configuration (only the user's settings) and the scene,
-#: and returns the rows of the settings that the scene decides.
+#: Function of a planner. The function receives the configuration (only the user's settings) and the
+#: scene, and returns the decisions on settings that depend on the scene.
 Planner: TypeAlias = Callable[[RunConfig, Scene], Sequence[Decision]]
 #: Default length of a run if neither steps nor views nor seconds are set (3DGS).
 DEFAULT_STEPS = 30_000
@@ -79,7 +79,7 @@ def facts_of(config: RunConfig, scene: Scene) -> Facts:
 def with_decisions(
     config: RunConfig, scene: Scene
 ) -> tuple[RunConfig, tuple[Decision, ...], Decide]:
-    """Return the decided configuration, the table, and a function that makes the table again.
+    """Return the configuration with the decisions, the table, and a function that renews the table.
 
     With `--plan auto`, the planner's decisions about the scene come first. The recipe treats these
     decisions like settings of the user.
@@ -125,14 +125,14 @@ def table_of(config: RunConfig, scene: Scene, start: int | None = None) -> dict[
 
 
 def redecided(setup: Setup, planned: int, start: int | None = None) -> Setup:
-    """Return the run with numbers and rules decided again for its newly planned length.
+    """Return the setup with numeric settings and rules decided again for a newly planned length.
 
-    All other components stay the same.
+    All components except the rules stay the same.
 
     Args:
         setup: The run.
         planned: New planned number of steps.
-        start: Primitives at the start; None before they are counted.
+        start: Number of primitives at the start; None before they are counted.
     """
     numbers = {field.name for field in fields(Numbers)}
     rows = {row.setting: row for row in setup.decide(Length(planned, planned, start))}

@@ -1,4 +1,4 @@
-"""The device of a run: chosen by the user, or a GPU if a rasterizer works on it."""
+"""The device of a run: the user's choice, or a GPU if a rasterizer works on the GPU."""
 
 import logging
 
@@ -20,7 +20,7 @@ def choose_device(name: str) -> torch.device:
     """Return the torch device of this name.
 
     Raises:
-        UserError: There is no such device on this machine.
+        UserError: The device does not exist on this machine.
     """
     try:
         device = torch.device(name)
@@ -47,7 +47,7 @@ def _require_cuda(device: torch.device) -> None:
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if (device.index or 0) < count:
         return
-    # A torch build for AMD GPUs also calls them CUDA devices.
+    # A torch build for AMD GPUs also uses the name CUDA for these GPUs.
     built_for = torch.version.cuda or torch.version.hip
     if built_for is None:
         found, todo = "a build without CUDA", "install a CUDA build of torch"
@@ -65,7 +65,7 @@ def _require_cuda(device: torch.device) -> None:
 
 
 def with_device(config: RunConfig) -> tuple[RunConfig, tuple[str, ...]]:
-    """Return the configuration with the device that `auto` resolves to, and a note about it.
+    """Return the configuration with the device that `auto` chooses, and a note on this device.
 
     There is no note on a machine without a GPU.
     """
@@ -81,13 +81,13 @@ def with_device(config: RunConfig) -> tuple[RunConfig, tuple[str, ...]]:
     else:
         device, note = (
             "cuda",
-            f"device cuda: rasterizer {name} works on {gpu} (use --device cpu to avoid it)",
+            f"device cuda: rasterizer {name} works on {gpu} (use --device cpu to avoid the GPU)",
         )
     return config.model_copy(update={"device": device}), (note,)
 
 
 def _rasterizer(config: RunConfig) -> tuple[str, str]:
-    """Return the rasterizer for the GPU, and the reason against the GPU (empty if it is used).
+    """Return the rasterizer for the GPU, and the reason against the GPU (empty without a reason).
 
     A rasterizer that the user did not choose must be faster on the GPU than every rasterizer on the
     CPU.
@@ -98,14 +98,14 @@ def _rasterizer(config: RunConfig) -> tuple[str, str]:
     if name != AUTO:
         named = load(Rasterizer, name)
         runs = "cuda" in named.devices
-        return name, named.missing("cuda") if runs else f"rasterizer {name} does not run on it"
+        return name, named.missing("cuda") if runs else f"rasterizer {name} does not run on the GPU"
     on_cpu = max(speeds_on("cpu")[0].values(), default=0.0)
     speeds, notes = speeds_on("cuda")
     faster = {rasterizer: speed for rasterizer, speed in speeds.items() if speed > on_cpu}
     able = fastest_able(faster, demands(config, "cuda", *_trained(config)), notes)
     if able is not None:
         return able, ""
-    return name, sentences(*notes, *_missing()) or "no installed rasterizer is faster on it"
+    return name, sentences(*notes, *_missing()) or "no installed rasterizer is faster on the GPU"
 
 
 def _trained(config: RunConfig) -> tuple[Backbone, Densifier]:

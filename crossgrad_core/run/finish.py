@@ -1,4 +1,4 @@
-"""A run from its first step to its last file: its results are kept even if it fails."""
+"""A run from its first step to its last file; the results are saved even if the run fails."""
 
 import traceback
 from collections.abc import Callable, Sequence
@@ -28,13 +28,12 @@ from crossgrad_core.training.state import PhaseTimer, RollbackGuard, TrainingFai
 from crossgrad_core.training.step import final_edits
 from crossgrad_core.wording import one_line
 
-#: Texts in torch errors that report exhausted memory. Some of these errors also have their own
-#: type.
+#: Texts in torch errors that report exhausted memory.
 _NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory")
 
 
 def reason_of(error: BaseException) -> str:
-    """Return the reason of an error; for an unexpected error with its type and source location."""
+    """Return the reason of an error; for an unexpected error, add its type and source location."""
     if not is_unexpected(error):
         return str(error)
     text = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
@@ -44,7 +43,7 @@ def reason_of(error: BaseException) -> str:
 
 
 def is_unexpected(error: BaseException) -> bool:
-    """Return True if crossgrad did not write the message of the error for users."""
+    """Return True if the message of the error is not written for users."""
     return not isinstance(error, UserError | TrainingFailedError)
 
 
@@ -82,7 +81,7 @@ class Ending:
         status: `finished`, `stopped` (resumable) or `failed`.
         error: The reason of the failure and the missing results; None if nothing failed.
         traced: True if log.txt contains a traceback.
-        cause: The exception that ended training; None if there was none.
+        cause: The exception that ended training; None without an exception.
     """
 
     status: Status
@@ -96,12 +95,12 @@ class RunLoop:
     """A run in progress.
 
     Attributes:
-        setup: The setup; a run with a time budget replaces it.
-        state: The state; after an exception, the last good state.
+        setup: The setup; a run with a time budget replaces the setup.
+        state: The state of the training.
         session: The writer of the results.
         log: The run's log.txt.
         stopper: The requests to stop the run.
-        ending: The ending, as far as it is known.
+        ending: The ending so far.
     """
 
     setup: Setup
@@ -114,7 +113,7 @@ class RunLoop:
     def to_the_end(self, length: Length) -> Ending:
         """Train, then save and describe the final state.
 
-        Each part is attempted separately: if one part fails, the other parts still run, and the
+        The parts run one after another. If one part fails, the remaining parts still run, and the
         ending reports the failure.
         """
         self._attempt("", lambda: self._train(length))
@@ -123,8 +122,8 @@ class RunLoop:
         self._attempt("", lambda: self.session.align(self.setup, self.state))
         if self.session.gone:
             return self.ending
-        # A run cannot continue from a state that a failed step changed partly and that was not
-        # restored.
+        # Do not save a state that a failed step changed only partly, because a run cannot continue
+        # from such a state.
         if self.state.step > 0 and not self.state.touched:
             self._attempt("no checkpoint", lambda: self.session.save(self.setup, self.state))
             self._describe()
@@ -160,7 +159,7 @@ class RunLoop:
                     # Copy the state, so that a later rollback cannot return to a step before the
                     # change of length.
                     guard.copy(state)
-                # If the configuration is the same object, the planned length is already written.
+                # Write the file only if the planned length has changed.
                 if revised.config is not self.setup.config:
                     folder = self.session.folder
                     write_config(folder, revised.config, read_notes(folder))
@@ -179,7 +178,7 @@ class RunLoop:
             self.setup.hook.crossgrad_log(text=edit.note)
 
     def _catch_up(self) -> None:
-        """Evaluate if an earlier session ended before its evaluation."""
+        """Evaluate the state if an earlier session ended before the evaluation of its last step."""
         setup, state, session = self.setup, self.state, self.session
         if evaluates_after(setup, state.step) and not session.has_row(state.step):
             session.evaluate(setup, state)
@@ -203,7 +202,7 @@ class RunLoop:
             try:
                 return action()
             except Exception as error:
-                # Compiled code can replace an interrupt by its own error.
+                # Compiled code may raise its own exception instead of `KeyboardInterrupt`.
                 if self.stopper.at_once:
                     raise KeyboardInterrupt from error
                 raise
@@ -227,7 +226,7 @@ class RunLoop:
         except KeyboardInterrupt:
             if self.ending.error is None:
                 self.ending = replace(self.ending, status="stopped")
-        except (Exception, SystemExit) as error:  # Third-party code may raise anything.
+        except (Exception, SystemExit) as error:  # Third-party code may raise any exception.
             self._note(error, missing)
 
     def _note(self, error: BaseException, missing: str) -> None:
@@ -258,7 +257,7 @@ class RunLoop:
 
 
 def exit_messages(course: RunLoop) -> list[str]:
-    """Return messages about a failed, empty or unfinished run, and how to continue it."""
+    """Return messages about a failed, empty or unfinished run, and the command to continue it."""
     ending, folder = course.ending, course.session.folder
     lines = []
     if not course.state.primitives(course.setup):
@@ -284,15 +283,15 @@ def overdone(rows: Sequence[Row]) -> list[str]:
     gap, step = best["psnr"] - last, best["step"]
     return [
         (
-            f"the last evaluation is {gap:.2f} dB lower than at step {step:.0f}, which "
-            f"had {best['psnr']:.2f} dB after {best['train_seconds']:,.0f} s of training: "
+            f"the last evaluation is {gap:.2f} dB lower than at step {step:.0f} "
+            f"({best['psnr']:.2f} dB after {best['train_seconds']:,.0f} s of training): "
             "a shorter run may be sufficient (--max-views N)"
         )
     ]
 
 
 def next_lines(folder: Path) -> list[str]:
-    """Return what shows and delivers the results of a finished run: commands, and its page."""
+    """Return the commands that render and export the results of a finished run, and its page."""
     run = one_line(quote(str(folder)))
     lines = [f"next: crossgrad render {run} (images), crossgrad export {run} (a file for viewers)"]
     if (folder / PAGE).is_file():
@@ -306,7 +305,7 @@ def resume_line(folder: Path) -> str:
 
 
 def _kept(course: RunLoop) -> list[str]:
-    """Return a line about the state if the newest checkpoint does not contain it."""
+    """Return a line about the last step if no checkpoint contains the state after this step."""
     step = course.state.step
     saved = max(named_checkpoints(course.session.folder / CHECKPOINTS), default=0)
     if saved >= step:
@@ -315,18 +314,18 @@ def _kept(course: RunLoop) -> list[str]:
     return [f"the state of step {step} could not be saved; {there}"]
 
 
-#: Number of steps and number of training seconds to observe before the estimate. The very first
-#: step is left out.
+#: Number of steps and of training seconds that are measured before the remaining time is estimated.
+#: The first step of a session is not measured.
 LOOK_STEPS, LOOK_SECONDS = 3, 2.0
-#: No estimate is shown if less time than this remains, in seconds.
+#: Shortest remaining time for which an estimate is shown, in seconds.
 WORTH_A_LINE = 60.0
 
 
 class Forecast:
-    """A wrapper of a length that logs once how long the remaining steps will take.
+    """A wrapper of a `Length` that logs once how long the remaining steps will take.
 
     Args:
-        length: The length that decides about the end of the run.
+        length: The rule for the number of steps of the run.
     """
 
     def __init__(self, length: Length) -> None:
@@ -335,13 +334,13 @@ class Forecast:
         self._told = False
 
     def due(self, state: TrainState) -> bool:
-        """Return True if there is anything to decide or to log."""
+        """Return True if `revised` has to decide the length or to log the estimate."""
         if self._first is None:
             self._first = state.step, state.clock.train
         return self._length.due(state) or self._is_time(state)
 
     def revised(self, setup: Setup, state: TrainState) -> Setup:
-        """Return the setup with the current length; log the estimate when it is due."""
+        """Return the setup with the present length, and log the estimate if it is due."""
         if self._length.due(state):
             setup = self._length.revised(setup, state)
         if self._is_time(state):

@@ -1,4 +1,4 @@
-"""Assembling a run from settings, or loading it from its folder so that it can continue."""
+"""Functions that assemble a run from settings, or load a run from its folder."""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -54,8 +54,8 @@ from crossgrad_core.training.start import first_state
 from crossgrad_core.training.state import Clock, Counters, TrainState
 from crossgrad_core.wording import in_one_line, listed, plural, singular
 
-#: Settings that do not affect the trained result, or that a resumed run may have changed: paths,
-#: times of evaluations, the number of tolerated faults, and a length that follows a time budget.
+#: Settings that do not affect the trained result, or that a resumed run may have changed. Examples
+#: are paths, the times of evaluations, and the length of a run with a time budget.
 _LOOSE: Final = frozenset(
     {
         "clock",
@@ -83,23 +83,24 @@ _LOOSE: Final = frozenset(
         "threads",
     }
 )
-#: Slot whose component may be missing on another machine.
+#: Slot whose component may differ on another machine.
 _DRAWN: Final = "rasterizer"
 #: Key that records whether the length follows a time budget.
 _TIMED: Final = "time budget"
 
 
 def settings_of(config: RunConfig) -> dict[str, Json]:
-    """Return the settings that affect training, flat (`loss.ssim_weight`), and the version."""
+    """Return the version and the settings that affect training, such as `loss.ssim_weight`."""
     loose = set(_LOOSE)
     if config.planned_seconds is None:
         loose -= {"revisions"}
     else:
-        loose |= {"steps"}  # The run may have changed the number to meet its time budget.
+        loose |= {"steps"}  # The run may have changed the number of steps to meet its time budget.
     data = config.model_dump(mode="json", exclude=loose)
-    # Another machine may use another rasterizer, but its options still count.
+    # Ignore the rasterizer, because another machine may use another rasterizer, but compare its
+    # options.
     del data[_DRAWN]["name"]
-    # Use the default of `_config` for a run that did not write this setting.
+    # Use the default of `_config` if the configuration of the run does not contain this setting.
     data |= {
         "sh_from": config.sh_from or 0,
     }
@@ -115,7 +116,8 @@ def to_checkpoint(state: TrainState, config: RunConfig | None = None) -> Checkpo
 
     Args:
         state: The state.
-        config: The configuration that trained the state, if a later load must compare it.
+        config: The configuration that trained the state; None if a later load need not compare
+            settings.
     """
     scalars: dict[str, Any] = {
         "settings": {} if config is None else settings_of(config),
@@ -137,11 +139,11 @@ def to_checkpoint(state: TrainState, config: RunConfig | None = None) -> Checkpo
 
 
 def from_checkpoint(setup: Setup, checkpoint: Checkpoint) -> TrainState:
-    """Return the state that continues bit for bit from the checkpoint.
+    """Return the state of a checkpoint, from which training continues with bitwise equal results.
 
     Raises:
-        UserError: The checkpoint is not a state of this run (another backbone or other photos), or
-            it is damaged.
+        UserError: The checkpoint belongs to a run with another backbone or other photos, or the
+            checkpoint is damaged.
     """
     _check_tensors(setup, checkpoint)
     try:
@@ -159,24 +161,24 @@ def from_checkpoint(setup: Setup, checkpoint: Checkpoint) -> TrainState:
 
 
 def check_settings(config: RunConfig, checkpoint: Checkpoint) -> None:
-    """Refuse a state that was trained with other settings, as its results would be misattributed.
+    """Refuse a state that was trained with other settings than `config`.
 
     Raises:
-        UserError: Settings that affect training differ from the checkpoint's.
+        UserError: Settings that affect training differ from the settings in the checkpoint.
     """
     stored = checkpoint.scalars.get("settings")
     if not isinstance(stored, dict) or stored.get("crossgrad") != VERSION:
-        # Another version wrote the checkpoint. It stored no settings, or it used other names for
-        # them.
+        # Another version of crossgrad wrote the checkpoint. That version stored no settings, or it
+        # used other names for its settings.
         return
     ours = settings_of(config)
-    # A setting that did not exist when the checkpoint was written is not a change. A new option of
-    # a component may be a change.
+    # Ignore settings that did not exist when the checkpoint was written. Compare new options of an
+    # existing component, because they may change the training.
     known_components = {key.partition(".")[0] for key in stored}
     both = {key for key in ours.keys() | stored.keys() if key.partition(".")[0] in known_components}
-    # Ignore settings that only the configuration or only the checkpoint contains, if they are
-    # options of the rasterizer or settings of the length. Another rasterizer has other options. A
-    # run with a time budget lacks the settings of the length.
+    # Ignore options of the rasterizer and settings of the length that only the configuration or
+    # only the checkpoint contains. Another rasterizer has other options. A run with a time budget
+    # does not store the settings of the length.
     either = {_DRAWN, "steps", "revisions", "revised"}
     both -= {k for k in ours.keys() ^ stored.keys() if k.partition(".")[0] in either}
     changed = sorted(key for key in both if ours.get(key) != stored.get(key))
@@ -233,7 +235,8 @@ def _check_tensors(setup: Setup, checkpoint: Checkpoint) -> None:
     missing = [name for name in wanted if name not in parameters]
     if missing:
         raise _misfit(checkpoint, f"parameters {listed(wanted)}", f"no {listed(missing)}")
-    # Frozen parameters may be whole numbers, such as the levels of an octree.
+    # Check trained parameters only, because frozen parameters may be whole numbers, such as the
+    # levels of an octree.
     trained = [name for block in setup.trained_blocks for name in block.tensors]
     whole = [name for name in trained if not parameters[name].is_floating_point()]
     if whole:
@@ -286,7 +289,7 @@ _PLAIN: Final = {
     "operator": defaults.OPERATOR,
     "densifier": defaults.NO_DENSIFIER,
     "loss": defaults.LOSS,
-    # This initializer needs no points, because the scene may have none.
+    # Use an initializer that needs no points, because the scene may contain no points.
     "initializer": defaults.INITIALIZER_WITHOUT_POINTS,
     "resolution": defaults.RESOLUTION,
 }
@@ -295,7 +298,7 @@ REPLACEABLE: Final = frozenset({*_PLAIN, *map(singular, MANY)})
 
 
 def without_missing(config: RunConfig) -> RunConfig:
-    """Return the configuration with defaults in place of missing components that only train.
+    """Return the configuration with default components in place of missing training components.
 
     Metrics, observers and rules that are not installed are left out.
     """
@@ -317,7 +320,7 @@ def without_missing(config: RunConfig) -> RunConfig:
         lacking.append(f"rules {listed(gone)}")
         update["rules"] = {n: options for n, options in config.rules.items() if n not in gone}
     if lacking:
-        _LOG.warning("not installed here, so they are not used: %s", listed(lacking))
+        _LOG.warning("components that are not installed here are not used: %s", listed(lacking))
     return config.model_copy(update=update)
 
 
@@ -342,7 +345,7 @@ def as_it_was(config: RunConfig, trained: RunConfig) -> RunConfig:
 
 #: Status of a run that wrote its results and a checkpoint.
 _WITH_RESULTS: Final[tuple[Status, ...]] = ("finished", "stopped")
-#: Note that a run gets if it has to start again.
+#: Note of a run that starts again, because it has no checkpoint.
 BEGINS_AGAIN = "no checkpoint yet: the run starts again from its configuration"
 
 
@@ -353,7 +356,7 @@ def set_up(
     *,
     looks: bool = False,
 ) -> tuple[Setup, float]:
-    """Return the assembled run, and the seconds that reading the scene and assembling took.
+    """Return the assembled run, and the time for reading the scene and assembling, in seconds.
 
     Args:
         config: The configuration, with a scene.
@@ -368,7 +371,8 @@ def set_up(
     configure_threads(config.threads)
     start = perf_counter()
     path = cast("Path", config.scene)
-    # A resumed run began with this scene, so the scene was accepted then.
+    # Accept inconsistent data in the scene of a resumed run, because the run accepted the scene at
+    # its start.
     scene, reader = (
         read_scene(config, path)
         if looks
@@ -385,10 +389,10 @@ def set_up(
 
 
 def _refuse_lost_checkpoints(folder: Path) -> None:
-    """Refuse to restart a run whose checkpoints were removed, to protect its results.
+    """Refuse to start a run again if it has results but no checkpoints.
 
     Raises:
-        UserError: The run has results, so it must have had checkpoints.
+        UserError: The run has results, which a restart would replace.
     """
     for status in _WITH_RESULTS:
         if step := summarised_step(folder, status):
@@ -404,7 +408,7 @@ def _refuse_lost_checkpoints(folder: Path) -> None:
 
 
 def require_checkpoint(folder: Path) -> None:
-    """Refuse a folder that has no trained state yet; nothing is written to the folder.
+    """Refuse a folder without a checkpoint; nothing is written to the folder.
 
     Raises:
         UserError: The folder is not a run, or the run has no checkpoint.
@@ -419,7 +423,7 @@ def require_checkpoint(folder: Path) -> None:
             found=writer or "a run that ended before its first checkpoint",
             todo="wait for the first checkpoint"
             if writer
-            else f"start it again: crossgrad run --resume {folder}",
+            else f"start the run again: crossgrad run --resume {folder}",
         )
 
 
@@ -453,9 +457,9 @@ def continued(
     accept_scene: bool = False,
     accept_plugins: bool = False,
 ) -> tuple[Setup, TrainState]:
-    """Load a run's setup and the state from which it continues.
+    """Load a run's setup and the state from which the run continues.
 
-    This is the newest state, or the initial state if the run has no checkpoint yet.
+    The state is the state of the newest checkpoint, or the initial state if there is no checkpoint.
 
     Args:
         folder: The run's folder.
@@ -492,8 +496,8 @@ def _from(
     looks: bool = False,
 ) -> tuple[Setup, TrainState]:
     checkpoint = load_latest(folder)
-    # Read this file after the checkpoint, because a run with a time budget only adds settings to
-    # the file.
+    # Read the configuration after the checkpoint. A run with a time budget may add settings to the
+    # file at any time, and older settings stay valid.
     config = _config(folder, settings)
     config_now = without_missing(config) if looks else config
     setup, seconds = set_up(config_now, verbosity, check, looks=looks)
@@ -519,7 +523,7 @@ def _noted(folder: Path, setup: Setup, packages: Packages | None) -> tuple[str, 
 
 
 def _config(folder: Path, settings: Mapping[str, Any]) -> RunConfig:
-    """Return the run's own configuration, overridden by the changeable settings in `settings`."""
+    """Return the configuration in the run's folder, with changeable settings from `settings`."""
     frozen = sorted(set(settings) - CHANGEABLE)
     if frozen:
         raise UserError(
@@ -530,7 +534,8 @@ def _config(folder: Path, settings: Mapping[str, Any]) -> RunConfig:
         )
     stored = read_config(folder)
     stored.pop("stop_after", None)
-    # Runs write the initial degree. Runs of the first versions started with degree 0.
+    # A missing SH degree means degree 0, because the first versions of crossgrad started with
+    # degree 0.
     stored["sh_from"] = stored.get("sh_from") or 0
     try:
         config = parsed({**stored, **settings})

@@ -1,4 +1,4 @@
-"""The settings that are options of `crossgrad run`, read from the schema of a run."""
+"""The settings that are options of `crossgrad run`, read from the fields of `RunConfig`."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,7 +12,8 @@ from pydantic.fields import FieldInfo
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.flags import Flag
 
-#: Types that an option keeps. Every other value is read as text and validated by the schema.
+#: Types that the command line parses. Values of all other types are read as text, and `RunConfig`
+#: validates them.
 _OWN_TYPES: Final = (int, float, Path)
 
 
@@ -56,5 +57,5 @@ def _kind(field: FieldInfo) -> object:
     return kind if kind in _OWN_TYPES else str
 
 
-#: All options in the order of the schema.
+#: All options in the order of the fields of `RunConfig`.
 OPTIONS: Final = tuple(_options(RunConfig))

@@ -1,4 +1,4 @@
-"""The choice of a rasterizer if none is named, or if a run's own does not support the device."""
+"""The choice of a rasterizer that supports the device and the requirements of a run."""
 
 import logging
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ class Wanted:
 
     Attributes:
         device: Torch device type.
-        response: The backbone's pixel response.
+        response: The value `response` of the backbone.
         outputs: Optional outputs that the densifier needs.
         options: Options that the user or the recipe sets.
     """
@@ -34,7 +34,7 @@ class Wanted:
     options: frozenset[str] = frozenset()
 
     def lacking(self, rasterizer: type[Rasterizer]) -> tuple[str, ...]:
-        """Return the demands that a rasterizer does not meet."""
+        """Return the requirements that a rasterizer does not meet."""
         return tuple(
             sorted(
                 ({self.response} - rasterizer.responses)
@@ -45,7 +45,7 @@ class Wanted:
 
 
 def demands(config: RunConfig, device: str, backbone: Backbone, densifier: Densifier) -> Wanted:
-    """Return the demands of a run on its rasterizer for a device type."""
+    """Return the requirements of a run on its rasterizer for a device type."""
     of_recipe = frozenset() if is_complete(config) else recipe_of(config).rasterizer_options
     return Wanted(
         device=device,
@@ -59,13 +59,13 @@ def choose_rasterizer(name: str, wanted: Wanted) -> tuple[str, tuple[str, ...]]:
     """Return the name of the rasterizer, and notes about the reason for the choice.
 
     Every installed rasterizer reports its speed on the device. The fastest rasterizer that meets
-    the requirements is chosen; among equally fast rasterizers, the first by name. If no rasterizer
-    meets the requirements, the fastest is chosen, and later checks report why it cannot work. A
-    rasterizer that cannot be imported is left out. Rasterizers slower than the chosen one are not
-    imported.
+    the requirements is chosen. Among equally fast rasterizers, the first by name is chosen. If no
+    rasterizer meets the requirements, the fastest rasterizer is chosen, and later checks report why
+    this rasterizer cannot work. A rasterizer that cannot be imported is left out. Rasterizers
+    slower than the chosen rasterizer are not imported.
 
     Args:
-        name: The user's choice; `auto` leaves it open.
+        name: The user's choice; `auto` if the user did not choose a rasterizer.
         wanted: The requirements of the run.
 
     Raises:
@@ -90,7 +90,7 @@ def choose_rasterizer(name: str, wanted: Wanted) -> tuple[str, tuple[str, ...]]:
 
 
 def fastest_able(speeds: Mapping[str, float], wanted: Wanted, notes: list[str]) -> str | None:
-    """Return the fastest rasterizer that meets the requirements; None if none of them does.
+    """Return the fastest rasterizer that meets the requirements; None if no rasterizer does.
 
     Args:
         speeds: Name -> speed.
@@ -110,9 +110,9 @@ def fastest_able(speeds: Mapping[str, float], wanted: Wanted, notes: list[str]) 
 
 
 def drawn_elsewhere(config: RunConfig) -> RunConfig:
-    """Return a run's configuration for another device, with a rasterizer that runs there.
+    """Return a run's configuration for another device, with a rasterizer that supports the device.
 
-    Only the options that every possible rasterizer has are kept.
+    The configuration keeps only options that all rasterizers for the device support.
 
     Raises:
         UserError: The run's own rasterizer is not installed.
@@ -135,7 +135,7 @@ def drawn_elsewhere(config: RunConfig) -> RunConfig:
 def speeds_on(device: str) -> tuple[dict[str, float], list[str]]:
     """Return name -> speed of a device's rasterizers, and notes on broken rasterizers.
 
-    A rasterizer that declares its speed without an import is not imported.
+    A rasterizer whose package declares a separate speed function is not imported.
     """
     speeds: dict[str, float] = {}
     notes = []

@@ -1,4 +1,4 @@
-"""The configuration with which a run was carried out, with every decision filled in."""
+"""The complete configuration of a run, including all decisions."""
 
 from pathlib import Path
 from typing import Any, Literal
@@ -16,9 +16,9 @@ ALWAYS = (
 
 
 def resolved(setup: Setup) -> RunConfig:
-    """Return a configuration that repeats the run: components with all options, K and steps fixed.
+    """Return the configuration that repeats the run, with all options, K and the number of steps.
 
-    The output folder is left out, so that the repetition gets a folder of its own.
+    The configuration contains no output folder, so that the repeated run gets a new folder.
     """
     config, selection = setup.config, setup.selection
     components, names = selection.components, selection.names
@@ -53,7 +53,7 @@ def resolved(setup: Setup) -> RunConfig:
 
 
 def _located(path: Path | None) -> Path | None:
-    """Return the absolute path if it exists; any other path is taken relative to the scene."""
+    """Return the absolute path if the path exists; a path relative to the scene is unchanged."""
     return path.resolve() if path is not None and path.exists() else path
 
 

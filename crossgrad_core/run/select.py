@@ -1,4 +1,4 @@
-"""Choice of the components of a run for its scene, and the number of views per step."""
+"""The choice of the components of a run and of the number of views per step."""
 
 from pathlib import Path
 from typing import Final, TypeVar
@@ -32,12 +32,12 @@ from crossgrad_core.wording import listed
 
 #: The base class of a slot.
 C = TypeVar("C", bound=Component)
-#: The search for a K that suits both sampler and operator ends before this number.
+#: Upper limit (exclusive) of the search for a K that sampler and operator support.
 _MOST_VIEWS: Final = 13
 
 
 def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, list[str]]:
-    """Return the components, fitted to the scene, and notes on choices and omissions.
+    """Return the components, fitted to the scene, and messages about the choices.
 
     Raises:
         UserError: A name or option is wrong.
@@ -142,7 +142,7 @@ def _require_shown_points(config: RunConfig, scene: Scene, start: Initializer) -
 
 
 def _require_decided_options(config: RunConfig, name: str) -> None:
-    """Refuse a rasterizer that lacks an option which the recipe sets."""
+    """Refuse a rasterizer without an option that the recipe sets."""
     lacking = config.rasterizer.options.keys() - load(Rasterizer, name).model_fields.keys()
     if decided := sorted(option for option in lacking if f"rasterizer.{option}" in config.decided):
         raise UserError(
@@ -166,15 +166,15 @@ def chosen(slot: type[C], choice: ComponentChoice | None) -> C:
 
 
 def _name(choice: ComponentChoice | None) -> str:
-    """Return the name of a component; the recipe has already filled in open names."""
+    """Return the name of the chosen component, or `auto` without a choice."""
     return AUTO if choice is None else choice.name
 
 
 def _metrics(config: RunConfig, scene: Scene, notes: list[str]) -> dict[str, Metric]:
-    """Return the metrics by name; a default metric is left out if a column would occur twice.
+    """Return the metrics by name; leave out a default metric whose column already exists.
 
     Raises:
-        UserError: Two columns of metrics.csv would have one name.
+        UserError: Two columns of metrics.csv would have the same name.
     """
     metrics: dict[str, Metric] = {}
     regimes = sorted({view.regime for view in scene.test_views})
@@ -213,7 +213,7 @@ def _check_form(name: str, form: str) -> None:
 
 
 def _or_default(choice: ComponentChoice | None, name: str) -> ComponentChoice:
-    """Return the component choice; if its name is open, it gets the default name."""
+    """Return the component choice; replace a missing name or `auto` by the default name."""
     if choice is None:
         return ComponentChoice(name=name)
     return choice.model_copy(update={"name": name}) if choice.name == AUTO else choice
@@ -224,7 +224,7 @@ def _grouping_choice(
 ) -> ComponentChoice | None:
     if config.grouping is not None and config.grouping.name != AUTO:
         return config.grouping
-    # A sampler that makes its own labels needs no grouping.
+    # Ignore the operator's default grouping if the sampler makes its own labels.
     of_operator = None if sampler.own_labels else operator.resolved_grouping
     name = sampler.default_grouping or of_operator
     if name is not None:
@@ -241,7 +241,7 @@ def _grouping_choice(
 
 
 def operator_of(config: RunConfig) -> tuple[Operator, str]:
-    """Return the operator of a run (a chain if several are named), and its name."""
+    """Return the operator of a run and its name; several operators form a chain."""
     links = config.operators
     built = tuple(build(Operator, link.name, link.options) for link in links)
     operator = built[0] if len(built) == 1 else build(Operator, CHAIN, {"links": built})
@@ -249,9 +249,10 @@ def operator_of(config: RunConfig) -> tuple[Operator, str]:
 
 
 def views_per_step_of(config: RunConfig) -> tuple[ViewsPerStepSpec, str]:
-    """Return K of each step, and why it differs from the sampler's default (empty if it does not).
+    """Return K of each step, and the reason if K differs from the sampler's default; else empty.
 
-    If no K is set, K is the sampler's default, or the smallest K at which the operator works.
+    If the user sets no K, K is the sampler's default. If the operator does not work with this K, K
+    is the smallest number that both components support.
     """
     if config.view_plan is not None:
         return config.view_plan, ""
@@ -260,11 +261,11 @@ def views_per_step_of(config: RunConfig) -> tuple[ViewsPerStepSpec, str]:
     default_views = sampler.resolved_views
     of_sampler = (k for k in range(1, _MOST_VIEWS) if sampler.view_counts.admits(k))
     both = [k for k in of_sampler if operator.views.admits(k)]
-    # A user who names no operator expects only the sum of the gradients.
+    # Do not raise K for the default operator, because it only sums the gradients.
     named = config.operator != RunConfig.model_fields["operator"].default
     chosen_views, why = default_views, ""
     if default_views not in both:
-        # If no K suits both, the validation of the selection reports it.
+        # If no K is supported by both components, the later validation raises an error.
         chosen_views, why = next(iter(both), default_views), f"the operator needs {operator.views}"
     elif named and operator.needs_more_views(default_views):
         chosen_views = next((k for k in both if not operator.needs_more_views(k)), default_views)

@@ -1,4 +1,4 @@
-"""The writer of a run's results, during training and at the end."""
+"""The class that writes the results of a run during training and at the end."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -42,7 +42,7 @@ PANELS = 4
 
 
 class Session:
-    """The writer of one run's folder; the training loop passes its results here.
+    """A writer of the files in a run's folder; the training loop calls its methods.
 
     Args:
         folder: The run's folder.
@@ -78,11 +78,11 @@ class Session:
         return session
 
     def has_row(self, step: int) -> bool:
-        """Return True if metrics.csv has a row of that step or of a later step."""
+        """Return True if metrics.csv contains a row of a step or of a later step."""
         return self._evaluated_step >= step
 
     def result(self, step: int) -> EvaluationResult | None:
-        """Return the evaluation after that step; None if there was none."""
+        """Return the results of the evaluation after a step; None without an evaluation."""
         return self._result[1] if self._result is not None and self._result[0] == step else None
 
     def evaluate(self, setup: Setup, state: TrainState, panels: int = 0) -> None:
@@ -131,7 +131,7 @@ class Session:
         return not self.folder.is_dir()
 
     def _require_folder(self) -> None:
-        """Refuse to create a second folder if the run's folder was moved or removed.
+        """Raise an error if the run's folder was moved or removed.
 
         Raises:
             UserError: The folder does not exist.
@@ -141,23 +141,24 @@ class Session:
                 "the folder of the run no longer exists",
                 where=self.folder,
                 expected="the folder that the run was started in",
-                todo="if it was moved, resume the run there: `crossgrad run --resume FOLDER`",
+                todo="if the folder was moved, resume the run in its new folder: `crossgrad run "
+                "--resume FOLDER`",
             )
 
     def rewind(self, setup: Setup, step: int) -> None:
-        """Drop rows and checkpoints after `step`, because training was rolled back to it."""
+        """Delete rows and checkpoints after `step`, to which training was rolled back."""
         self._table = MetricsCsv.resume(self.folder, columns_of(setup), step)
         drop_later(self.folder, step)
         self._saved_step = self._evaluated_step = -1
 
     def renew(self, setup: Setup, step: int) -> None:
-        """Drop the row of `step`, whose state has changed, so that it can be saved again."""
+        """Delete the row of `step` and allow a new save, because the state has changed."""
         if self.has_row(step):
             self._table = MetricsCsv.resume(self.folder, columns_of(setup), step - 1)
         self._saved_step = self._evaluated_step = -1
 
     def align(self, setup: Setup, state: TrainState) -> None:
-        """Drop rows and checkpoints after the state's step, if there are any."""
+        """Delete rows and checkpoints of steps after the state's step."""
         if max(self._saved_step, self._evaluated_step) > state.step:
             self.rewind(setup, state.step)
 
@@ -195,7 +196,7 @@ class Session:
     def summarise(
         self, setup: Setup, state: TrainState, status: Status, error: str | None = None
     ) -> None:
-        """Write summary.json, which describes the run as a whole."""
+        """Write summary.json."""
         with reporting(state):
             machine = self.machine.figures(state.clock.train)
         summary = Summary(
@@ -219,7 +220,7 @@ class Session:
 
 @contextmanager
 def reporting(state: TrainState) -> Iterator[None]:
-    """Add the seconds of the block to the reporting time."""
+    """Add the duration of the block to the reporting time."""
     start = perf_counter()
     yield
     state.clock.report += perf_counter() - start
@@ -252,7 +253,10 @@ def columns_of(setup: Setup) -> tuple[str, ...]:
 
 
 def view_counts(setup: Setup, result: EvaluationResult | None) -> dict[str, int]:
-    """Return the number of held-out views (if known, of measured views), overall and per regime."""
+    """Return the number of held-out views, overall and per regime.
+
+    After an evaluation, only views with metrics count.
+    """
     if result is not None:
         regimes = {regime: means.views for regime, means in result.regimes.items()}
         return {"overall": result.overall.views, **regimes}

@@ -1,7 +1,7 @@
-"""Settings of a run from a file, from options and from `--set`; later sources win.
+"""Settings of a run from a file, options and `--set`; each source overrides the previous one.
 
-The result is a nested dictionary in the shape of `crossgrad_core.config.RunConfig`, which validates
-it and reports unknown keys and values out of bounds.
+The result is a nested dictionary in the shape of `crossgrad_core.config.RunConfig`. The class
+`RunConfig` validates this dictionary and reports unknown keys and invalid values.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -27,9 +27,9 @@ from crossgrad_core.wording import listed, plural, singular, with_article
 
 Settings: TypeAlias = dict[str, Any]
 
-#: Setting that holds a list of components -> the option that adds to the list.
+#: Setting that contains a list of components -> the option that adds a component to the list.
 ADDING: Final = {"observers": "--observe", "metrics": "--metrics"}
-#: Settings that name one component (or a chain of operators) and contain its options.
+#: Settings that contain the name and the options of a component, or of a chain of operators.
 CHOICES: Final = tuple(singular(slot) for slot in GROUPS if slot not in MANY)
 #: Settings that determine the length of a run.
 LENGTHS: Final = tuple(
@@ -42,28 +42,26 @@ LENGTHS: Final = tuple(
 #: Other settings on which a recipe's decisions depend. If one of these settings changes, the recipe
 #: decides again.
 _DECIDING: Final = ("recipe", "backbone", "densifier", "operator", "sampler", "views_per_step")
-#: Settings that contain settings.
+#: Settings that are groups of other settings.
 GROUPS_OF_SETTINGS: Final = ("data",)
 _FILE: Final = (
     "the configuration file",
     "correct the file or the option; the config.yaml of a run is an example",
 )
-#: Options of the command line -> their setting.
+#: Name of a command-line option -> path of its setting.
 _PLACES: Final = {option.name: option.path for option in OPTIONS}
 
 
 def merged(
     config: Path | None, options: Mapping[str, object], assignments: Sequence[str]
 ) -> Settings:
-    """Return the settings that a user asked for.
+    """Return the settings from a configuration file, options and assignments.
 
     Args:
         config: YAML file, or None.
-        options: Option name -> value; None and empty lists if the user did not give it. A name may
-            be the option of a component, as in `operator.c`.
-        assignments: `KEY=VALUE` texts, values in YAML.
-
-    Raises:
+        options: Option name -> value. None or an empty list means that the user did not give the
+            option. A name may be the option of a component, as in `operator.c`.
+        assignments: `KEY=VALUE` texts, values in YAML. Raises:
         UserError: The file cannot be read, or an assignment is malformed.
     """
     chosen = _places(options)
@@ -78,7 +76,7 @@ def name_file(
     """Add the configuration file to an error if the wrong setting comes from the file.
 
     Args:
-        error: An error about the settings of `merged`; changed in place.
+        error: An error about the result of `merged`. The function changes this error.
         config: The file, as given to `merged`.
         options: The options, as given to `merged`.
         assignments: The assignments, as given to `merged`.
@@ -94,13 +92,14 @@ def name_file(
 
 
 def layered(layers: Sequence[Mapping[str, object]], assignments: Sequence[str] = ()) -> Settings:
-    """Return the settings of several layers in their long form; later layers override earlier ones.
+    """Return the settings of several layers; later layers override earlier layers.
 
     Args:
         layers: Name of an option of `crossgrad run`, or key of a configuration file -> value. A
             layer that chooses another component drops the options that earlier layers gave to the
             previous component. A length replaces all lengths of earlier layers.
-        assignments: `KEY=VALUE` texts as after `--set`, values in YAML; they override all layers.
+        assignments: `KEY=VALUE` texts as after `--set`, values in YAML. Assignments override all
+            layers.
 
     Raises:
         UserError: An assignment, or a key with a dot, is malformed.
@@ -113,12 +112,12 @@ def layered(layers: Sequence[Mapping[str, object]], assignments: Sequence[str] =
 
 
 def with_recipe(settings: Mapping[str, Any]) -> Settings:
-    """Return the settings, with the values that their recipe fixes for settings that are open.
+    """Return the settings, completed by the values that their recipe fixes.
 
     A configuration that a run wrote already contains the fixed settings.
 
     Raises:
-        UserError: There is no such recipe.
+        UserError: The recipe does not exist.
     """
     choice = settings.get("recipe")
     if not isinstance(choice, Mapping) or "name" not in choice or settings.get("decided"):
@@ -159,7 +158,7 @@ def _places(options: Mapping[str, object]) -> dict[tuple[str, ...], object]:
     """Return path of a setting -> the user's value, without None and empty lists.
 
     Raises:
-        UserError: A value is not a rule, or a rule is added and left out.
+        UserError: A value is not a rule, or the same rule is both added and removed.
     """
     places: dict[tuple[str, ...], object] = {}
     for name, value in options.items():
@@ -230,9 +229,10 @@ def _overlaid(
 
 
 def _opened(settings: Settings, paths: Sequence[tuple[str, ...]]) -> Settings:
-    """Return the settings, with decisions of the recipe removed if they must be made again.
+    """Return the settings without the decisions that the recipe must make again.
 
-    All decisions are made again if a setting changes that determines the length or kind of the run.
+    The recipe makes all decisions again if the length of the run or a setting in `_DECIDING`
+    changes.
     """
     opened = dict(settings)
     if {path[0] for path in paths} & {*_DECIDING, *(name for (name,) in LENGTHS)}:
@@ -248,7 +248,7 @@ def _named_by_default(settings: Settings) -> Settings:
 
 
 def _with_default_name(key: str, value: object) -> object:
-    """Return a component choice with a name; without a name, the default component is meant."""
+    """Return a component choice with a name; a missing name is replaced by the default name."""
     if key not in CHOICES or not isinstance(value, dict) or "name" in value:
         return value
     default = RunConfig.model_fields[key].default
@@ -261,7 +261,7 @@ def _of_file(path: Path) -> Settings:
 
 
 def _normalized(settings: Settings) -> Settings:
-    """Return the settings with every choice of components in its long form."""
+    """Return the settings with every component as a mapping of its name and options."""
     named = {current_name(key, settings): value for key, value in settings.items()}
     return {key: _long_form(key, value) for key, value in named.items()}
 
@@ -399,7 +399,7 @@ def _assign(settings: Settings, path: tuple[str, ...], value: object) -> None:
 
 
 def _listed(settings: Settings, key: str) -> object:
-    """Return the current list of components; the default list if none was given."""
+    """Return the current list of components, or the default list if the user gave no list."""
     given = settings.get(key)
     if given is not None:
         return given
@@ -411,7 +411,7 @@ def _in_list(value: object) -> list[object]:
 
 
 def _links(value: object) -> list[Settings]:
-    """Return the component choices in a setting: one component, a chain, or observers."""
+    """Return the component choices in a setting, which may be one component or a list."""
     return [choice for choice in _in_list(value) if isinstance(choice, dict)]
 
 
@@ -425,7 +425,7 @@ def _renamed(old: object, new: object) -> object:
 
 
 def _with_options(old: list[Settings], new: Settings) -> Settings:
-    """Return the new choice, with the options of an old choice of the same name or of no name."""
+    """Return the new choice with the options of an old choice that has the same name or no name."""
     for link in old:
         if link.get("name", new["name"]) == new["name"]:
             return {**link, **new}
@@ -435,8 +435,8 @@ def _with_options(old: list[Settings], new: Settings) -> Settings:
 def _extended(old: list[object], new: object) -> list[object]:
     """Return the old list extended by the new choices.
 
-    If both lists contain a choice, its options are merged. The validation later refuses values that
-    are not choices, and new names that occur twice.
+    If both lists contain the same component, its options are merged. The later validation refuses
+    values that are not component choices, and new names that occur twice.
     """
     extended, names = list(old), [link.get("name") for link in _links(new)]
     named = [(row, link) for row, link in enumerate(old) if isinstance(link, dict)]
@@ -453,7 +453,7 @@ def _extended(old: list[object], new: object) -> list[object]:
 
 
 def _holder(settings: Settings, path: tuple[str, ...]) -> Settings:
-    """Return the dictionary that holds the last part of a path; create it if it is missing."""
+    """Return the dictionary that contains the last key of a path; create a missing dictionary."""
     holder: object = settings
     for depth in range(len(path) - 1):
         holder = _inner(holder, path, depth)
@@ -467,7 +467,7 @@ def _holder(settings: Settings, path: tuple[str, ...]) -> Settings:
 
 
 def _inner(holder: object, path: tuple[str, ...], depth: int) -> object:
-    """Return the value that `path[depth]` names inside a value."""
+    """Return the value inside `holder` with the key `path[depth]`."""
     part = path[depth]
     match holder:
         case dict():

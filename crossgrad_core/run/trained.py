@@ -1,4 +1,4 @@
-"""A trained run as an object: its metrics, its views, its files.
+"""The class `Run`, which reads the metrics, views and files of a trained run.
 
 Reading metrics does not import torch; methods that render import torch.
 """
@@ -29,14 +29,14 @@ Columns: TypeAlias = dict[str, NDArray[np.float64] | NDArray[np.int64]]
 class Run:
     """A run and its folder.
 
-    Properties that read the folder (`metrics`, `summary`) read it again each time, so that a run
-    can be watched while it trains. The scene and the newest checkpoint are loaded at their first
-    use and stay in memory.
+    The properties `metrics` and `summary` read the files again at each access, so that a program
+    can watch a run while it trains. The scene and the newest checkpoint are loaded at their first
+    use and then kept in memory.
 
     Args:
         folder: The run's folder.
         device: Device of the tensors; by default the device of the run.
-        threads: CPU threads; all by default.
+        threads: Number of CPU threads; all by default.
         accept_scene: Accept a scene whose photos, masks, points or held-out views have changed.
     """
 
@@ -57,7 +57,7 @@ class Run:
 
     @property
     def metrics(self) -> "Columns":
-        """Column -> its numbers, one per evaluation, as in metrics.csv; NaN for a missing value.
+        """Column of metrics.csv -> one number per evaluation; NaN for a missing value.
 
         Raises:
             UserError: metrics.csv does not exist, or it does not contain numbers.
@@ -78,7 +78,7 @@ class Run:
 
     @property
     def scene(self) -> "Scene":
-        """The scene as the run sees it, in its local frame.
+        """The scene of the run, in its local frame.
 
         Raises:
             UserError: The scene cannot be read, or the run was trained on another scene.
@@ -93,7 +93,7 @@ class Run:
                 `run.scene.views[0].camera`.
 
         Returns:
-            [H, W, 3] in 0..1.
+            [H, W, 3] image with values in [0, 1].
 
         Raises:
             UserError: There is no view of that name, `view` is not a valid camera, or the run has
@@ -131,9 +131,9 @@ class Run:
         """Write the trained scene with the run's exporter, as `crossgrad export` does.
 
         Args:
-            path: The file.
-            camera: Name of the view for which view-dependent parts are baked; by default the
-                average over the training views.
+            path: Path of the output file.
+            camera: Name of the view for which view-dependent values are baked; by default, the
+                values are averaged over the training views.
             coordinates: input, local, enu, utm or epsg:N (docs/coordinates.md).
 
         Returns:
@@ -173,12 +173,12 @@ def open(  # noqa: A001 - users call it as `cg.open`
     threads: int | None = None,
     accept_scene: bool = False,
 ) -> Run:
-    """Open a run that was trained before, or is still training.
+    """Open a run that has been trained or is still training.
 
     Args:
         folder: The run's folder.
-        device: Device of the tensors; the run's own by default.
-        threads: CPU threads; all by default.
+        device: Device of the tensors; by default the device of the run.
+        threads: Number of CPU threads; all by default.
         accept_scene: Accept a scene whose photos, masks, points or held-out views have changed.
 
     Raises:
@@ -195,7 +195,7 @@ def _column(numbers: Sequence[float | None]) -> NDArray[np.float64] | NDArray[np
 
 
 class _Opened:
-    """A cache of one opened run, reloaded for each new checkpoint; see `Run` for the arguments."""
+    """A cache of one opened run, which is loaded again if there is a newer checkpoint."""
 
     def __init__(self, device: str | None, threads: int | None, accept_scene: bool) -> None:
         self._how = device, threads, accept_scene

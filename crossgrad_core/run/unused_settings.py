@@ -1,6 +1,6 @@
-"""Refusal of settings that would change nothing in a new run, with the reason and a remedy.
+"""Checks that refuse settings without an effect on a new run, with the reason and a remedy.
 
-A resumed run is not checked: its settings were accepted when it began.
+A resumed run is not checked, because its settings were accepted at its start.
 """
 
 from collections.abc import Iterator
@@ -44,7 +44,7 @@ def refuse_settings_for_nothing(config: RunConfig, setup: Setup) -> None:
     """Refuse settings of the user that have no effect in this run.
 
     Args:
-        config: The settings of the user, before any decision.
+        config: The settings of the user, without the recipe's decisions.
         setup: The assembled run.
 
     Raises:
@@ -68,7 +68,7 @@ def refuse_settings_for_nothing(config: RunConfig, setup: Setup) -> None:
             "some settings would have no effect",
             where=listed(name for name, _ in ineffective),
             found="; ".join(f"{name}: {why}" for name, why in ineffective),
-            todo="leave them out, or change the setting that makes them ineffective",
+            todo="leave these settings out, or change the setting that makes them ineffective",
         )
 
 
@@ -77,7 +77,7 @@ def _of_components(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]
         yield from _of_choice(slot, slot, getattr(config, slot), setup)
     links = config.operators
     for link in links:
-        # Options of an operator in a chain are set by the name of the operator.
+        # In a chain, the key of an operator's option contains the name of the operator.
         setting = "operator" if len(links) == 1 else f"operator.{link.name}"
         yield from _of_choice("operator", setting, link, setup)
 
@@ -88,8 +88,8 @@ def _of_choice(
     if choice is None or not choice.options:
         return
     name = setup.selection.names[slot] if choice.name == AUTO else choice.name
-    # Use the options as the user set them: a component that was fitted to the scene may have lost
-    # unneeded options.
+    # Build the component with the user's options, because the component of the run was fitted to
+    # the scene and may lack some of these options.
     component = build(plural(slot), name, choice.options)
     for option, why in set_for_nothing(component, setup.selection).items():
         yield f"{setting}.{option}", why
@@ -106,10 +106,13 @@ def _of_density_control(config: RunConfig, setup: Setup) -> Iterator[tuple[str, 
     if not densifier.edits and config.max_gaussians == AUTO:
         yield (
             "max_gaussians",
-            f"densifier {name} makes no edits, and auto sets no limit on the start",
+            f"densifier {name} makes no edits, and auto does not limit the initial Gaussians",
         )
     elif not densifier.edits and config.max_gaussians and config.data.init_file is not None:
-        yield "max_gaussians", f"densifier {name} makes no edits, and a PLY is used unchanged"
+        yield (
+            "max_gaussians",
+            f"densifier {name} makes no edits, and the Gaussians of a PLY file are used unchanged",
+        )
 
 
 def _of_resets(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
@@ -118,7 +121,7 @@ def _of_resets(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
             "reset_every",
             f"densifier {setup.selection.names['densifier']} makes no opacity resets",
         )
-    # A run with a time budget reports this as a note as soon as its length is known.
+    # A run with a time budget reports options without effect as a note when its length is planned.
     if not (config.seconds or config.planned_seconds):
         yield from without_resets(config, setup)
 
@@ -135,7 +138,7 @@ def without_resets(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]
 
 
 def _of_views(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
-    """Yield the settings on the views of a step that have no effect."""
+    """Yield settings about the views of a step that have no effect, with reasons."""
     densifier, name = setup.densifier, setup.selection.names["densifier"]
     one = setup.selection.views_per_step == 1
     if config.densify_views != "all" and not (densifier.edits and densifier.observes):
@@ -155,12 +158,12 @@ def _of_the_schedule(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str
     if config.clock == "cpu" and not (config.seconds or config.planned_seconds):
         yield "clock", "the length of the run is not given in seconds; add --seconds"
     stop, total = config.stop_after, setup.schedule.total
-    # A run with a time budget may become longer.
+    # Accept any `stop_after` in a run with a time budget, because the run may become longer.
     if stop is not None and stop > total and not (config.seconds or config.planned_seconds):
         yield "stop_after", f"the run ends after step {total}"
     if config.min_refinements and not setup.schedule.min_refinements:
-        why = "published or set by the user are not adapted"
-        yield "min_refinements", f"densification times that are counted in steps, {why}"
+        why = "published times and times set by the user are not adapted"
+        yield "min_refinements", f"densification times in steps, {why}"
     yield from _of_harmonics(config, setup)
 
 
@@ -225,7 +228,7 @@ def _of_the_start(config: RunConfig) -> Iterator[tuple[str, str]]:
     if asked and config.data.init != "points":
         yield (
             "initializer",
-            f"--init {config.data.init} has its own points; leave out one of the two",
+            f"--init {config.data.init} has its own points; leave out one of the two options",
         )
     if config.data.points is not None and config.data.init != "points":
         yield "data.points", f"--init {config.data.init} starts from other points"

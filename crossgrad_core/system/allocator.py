@@ -10,17 +10,17 @@ from typing import Any, Final
 TRIM_THRESHOLD: Final = -1
 TOP_PAD: Final = -2
 MMAP_THRESHOLD: Final = -3
-#: Number of bytes of freed memory that are kept, and size of the largest array on the heap (the
-#: upper bound of glibc).
+#: Maximum number of bytes of freed memory that the process keeps, and maximum size of an array on
+#: the heap (the upper bound of glibc).
 KEPT: Final = 512 << 20
 LARGEST: Final = 32 << 20
 #: Number of bytes by which the heap grows at first, and number of bytes by which it grows later.
-#: The first growth is small, so that it is not returned to the system at once. The heaps of other
-#: threads are returned to the system only in pieces of the later size.
+#: The first growth is smaller than `KEPT`, so that glibc does not return this memory to the system
+#: at once. glibc returns the heaps of other threads to the system only in pieces of the later size.
 FIRST: Final = KEPT - 2 * LARGEST
 LATER: Final = 16 << 20
-#: Size of a large page in bytes, and the `madvise` constant for large pages, which older headers
-#: may lack.
+#: Size of a large page in bytes, and the `madvise` constant for large pages, which the module
+#: `mmap` may not define.
 LARGE_PAGE: Final = 2 << 20
 _HUGE: Final[int] = getattr(mmap, "MADV_HUGEPAGE", 14)
 
@@ -29,8 +29,9 @@ _HUGE: Final[int] = getattr(mmap, "MADV_HUGEPAGE", 14)
 def keep_freed_memory() -> None:
     """Keep up to 512 MiB of freed memory in the process, for the arrays of the next step.
 
-    By default, glibc returns the memory to the system after every step. The kernel would then clear
-    each page again when the next step first writes to it. Other C libraries are not affected.
+    By default, glibc returns the memory to the system after every step. The operating system would
+    then clear each page again when the next step first writes to the page. Other C libraries are
+    not affected.
     """
     heap = _heap()
     if heap is not None:
@@ -39,11 +40,12 @@ def keep_freed_memory() -> None:
 
 
 def use_large_pages() -> None:
-    """Request large pages for the heap that is new since the previous call (Linux, glibc).
+    """Request large pages for the part of the heap that is new since the previous call.
 
-    Steps read and write Gaussians at scattered positions in arrays of many megabytes. With pages of
-    4 KiB, most accesses miss the processor's table of pages (TLB). The call is only a request: the
-    system may not support large pages, or may not provide any.
+    This function works on Linux with glibc only. Steps read and write Gaussians at scattered
+    positions in arrays of many megabytes. With pages of 4 KiB, most accesses miss the processor's
+    table of pages (TLB). The call is only a request: the system may not support large pages, or may
+    not provide any.
     """
     heap = _heap()
     if heap is not None:
@@ -62,7 +64,7 @@ class _Heap:
         self._asked = library.sbrk(0)
 
     def keep(self) -> None:
-        """Keep freed memory, and let the heap grow; memory that is never written costs nothing."""
+        """Keep freed memory and let the heap grow; unwritten memory uses no physical memory."""
         self._library.mallopt(TRIM_THRESHOLD, KEPT)
         self._library.mallopt(MMAP_THRESHOLD, LARGEST)
         self._library.mallopt(TOP_PAD, FIRST)
@@ -70,7 +72,7 @@ class _Heap:
         self._library.mallopt(TOP_PAD, LATER)
 
     def use_large_pages(self) -> None:
-        """Request large pages from the end of the heap at the previous call."""
+        """Request large pages for the part of the heap that is new since the previous call."""
         end = self._library.sbrk(0)
         begin = -(-self._asked // LARGE_PAGE) * LARGE_PAGE
         if begin < end:

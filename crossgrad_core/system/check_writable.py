@@ -1,4 +1,4 @@
-"""Checks before the work that results can be written; they leave no files behind."""
+"""Checks, before any work, whether results can be written; the checks leave no files."""
 
 import os
 import tempfile
@@ -25,7 +25,7 @@ def check_folder(folder: Path, needed: int = 0) -> None:
 
     Args:
         folder: The folder; it need not exist yet.
-        needed: Bytes that will be written.
+        needed: Number of bytes that will be written.
 
     Raises:
         UserError: The folder cannot be used; the message states the reason and a remedy.
@@ -45,7 +45,8 @@ def check_folder(folder: Path, needed: int = 0) -> None:
         # Write a test file, because permission bits are not reliable on network file systems.
         with disk_errors(folder), tempfile.TemporaryFile(dir=existing) as probe:
             probe.write(b"crossgrad")
-    except OSError as error:  # Some file systems, such as /proc, raise a special kind of error.
+    # Some file systems, such as /proc, raise errors that `disk_errors` does not convert.
+    except OSError as error:
         raise read_only(folder) from error
     if needed and free_bytes(existing) < needed:
         raise disk_full(folder, needed)
@@ -76,7 +77,7 @@ def check_own(path: Path) -> None:
             "the output path is a link or a special file, which crossgrad does not write to",
             where=path,
             found=found,
-            todo="remove it",
+            todo="remove the link or the special file",
         )
 
 
@@ -84,17 +85,17 @@ def check_new(*paths: Path) -> None:
     """Refuse files that already exist, so that no file of the user is overwritten.
 
     Raises:
-        UserError: A file exists; the message names the first one.
+        UserError: A file exists; the message names the first existing file.
     """
     for path in paths:
         with disk_errors(path):
             if path.exists():
-                todo = "choose another path, or remove it"
+                todo = "choose another path, or remove the file"
                 raise UserError("the output file already exists", where=path, todo=todo)
 
 
 def check_name(path: Path) -> None:
-    """Refuse a file if the longer name of its unfinished form is too long.
+    """Refuse a file if its temporary name, which is longer than its name, is too long.
 
     Raises:
         UserError: The name or the path is too long.

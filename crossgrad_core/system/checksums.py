@@ -19,10 +19,11 @@ from crossgrad_core.system.input_files import open_file, read_file
 from crossgrad_core.wording import one_line
 
 _LOG = logging.getLogger(__name__)
-#: The name of the file in a folder of results.
+#: Name of the file with the digests in a folder of results.
 SUMS: Final = "SHA256SUMS"
 _LINE: Final = re.compile(r"([0-9a-f]{64})  (.+)")
-#: Names with these characters would need escapes in SHA256SUMS.
+#: Characters that would need escapes in SHA256SUMS. The file does not list names with these
+#: characters.
 _UNLISTED: Final = re.compile(r"[\n\r\\]")
 
 
@@ -55,10 +56,10 @@ def drop_checksums(folder: Path) -> None:
 
 @contextmanager
 def relisted(folder: Path, *names: str) -> Iterator[None]:
-    """Let the block replace files of the folder; afterwards SHA256SUMS lists the new digests.
+    """Let the block replace files of a folder, and then write the new digests to SHA256SUMS.
 
-    If the process is killed inside the block, SHA256SUMS does not list the files. A folder without
-    SHA256SUMS does not get one.
+    If the process is killed inside the block, SHA256SUMS does not list these files. In a folder
+    without SHA256SUMS, the file is not created.
 
     Args:
         folder: The folder.
@@ -126,11 +127,12 @@ def check_unchanged(folder: Path, names: Iterable[str], todo: str) -> None:
 
     Args:
         folder: The folder.
-        names: The files that are going to be read; unlisted files pass.
-        todo: Advice on how to restore them.
+        names: The files that are going to be read. Files that SHA256SUMS does not list are not
+            checked.
+        todo: Advice on how to restore the files.
 
     Raises:
-        UserError: A file differs; the message names the first one.
+        UserError: The digest of a file differs; the message names the first such file.
     """
     for name in changed_files(folder, names):
         raise UserError(
@@ -143,7 +145,7 @@ def check_unchanged(folder: Path, names: Iterable[str], todo: str) -> None:
 
 
 def warn_if_changed(path: Path) -> None:
-    """Warn about a file that differs from SHA256SUMS; another program may have edited it."""
+    """Log a warning if the digest of a file differs from SHA256SUMS."""
     if changed_files(path.parent, [path.name]):
         _LOG.warning("%s has changed since its run wrote it: its SHA-256 differs", path)
 
@@ -167,5 +169,6 @@ def _unreadable(path: Path, found: str) -> UserError:
         where=path,
         expected="lines of a SHA-256 in hexadecimal digits, two spaces and a file name",
         found=found,
-        todo="restore the file from a copy, or remove it; without it the files are not checked",
+        todo="restore the file from a copy, or remove the file; then no file of the folder is "
+        "checked",
     )

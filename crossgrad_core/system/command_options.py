@@ -1,6 +1,6 @@
 """Options of a command, generated from the fields of a dataclass and grouped under headings.
 
-The help uses no rich, which would double the start-up time.
+The help does not use the package rich, because importing rich would double the start-up time.
 """
 
 from collections.abc import Callable
@@ -57,8 +57,8 @@ def command_of(
     """Return a decorator that turns a function into a command.
 
     Args:
-        options: A dataclass whose fields are `argument`s and `option`s. The function receives one
-            instance of this dataclass.
+        options: A dataclass whose fields are results of `argument` and `option`. The function
+            receives one instance of this dataclass.
     """
     kinds = get_type_hints(options)
     parameters = [
@@ -84,11 +84,11 @@ def command_of(
 
 
 class GroupedCommand(TyperCommand):
-    """A command whose help lists options by their `rich_help_panel`."""
+    """A command whose help lists the options under their headings (`rich_help_panel`)."""
 
     @override
     def format_options(self, ctx: "Context", formatter: "HelpFormatter") -> None:
-        """Write arguments, then groups of options as they were declared, then other options."""
+        """Write the arguments, the options with headings and the options without a heading."""
         groups: dict[str, list[tuple[str, str]]] = {"Arguments": []}
         others: list[tuple[str, str]] = []
         for parameter in self.get_params(ctx):

@@ -12,7 +12,7 @@ _CGROUP_LIMIT = Path("/sys/fs/cgroup/cpu.max")
 
 
 def available_cores() -> int:
-    """Return the number of usable cores: the affinity, limited by the CPU quota rounded up."""
+    """Return the number of cores in the affinity mask of the process, limited by the CPU quota."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return max(1, min(cores or 1, _quota(_CGROUP_LIMIT)))
 
@@ -29,8 +29,8 @@ def _quota(limit: Path) -> int:
 def let_idle_threads_sleep() -> None:
     """Let torch's idle threads sleep, unless the environment already sets a policy.
 
-    OpenMP threads otherwise spin for milliseconds on cores that other threads and programs need.
-    The call has an effect only before torch is imported.
+    Otherwise, idle OpenMP threads spin for milliseconds on cores that other threads and programs
+    need. The call has an effect only before torch is imported.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
@@ -42,7 +42,7 @@ def current_core() -> int | None:
 
 
 def keep_off(core: int | None, threads: Iterable[int]) -> None:
-    """Let threads (native numbers) run on all cores of this thread except `core`.
+    """Let threads (native ids) run on all cores that this thread may use, except `core`.
 
     Nothing changes if no core is left, if `core` is None, or for a thread that has ended.
     """
@@ -60,5 +60,6 @@ def _sched_getcpu() -> Callable[[], int] | None:
         return None
     import ctypes
 
-    # `PyDLL` keeps Python's lock, because this call is faster than releasing the lock.
+    # Use `PyDLL`, which does not release Python's global lock, because releasing the lock takes
+    # longer than this call.
     return getattr(ctypes.PyDLL(None), "sched_getcpu", None)

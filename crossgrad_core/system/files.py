@@ -1,4 +1,4 @@
-"""Files that appear complete or not at all, and disk errors as messages for users."""
+"""Functions that write a file completely or not at all, and user errors for disk errors."""
 
 import errno
 import os
@@ -30,7 +30,7 @@ def size_text(count: int) -> str:
 def free_bytes(path: Path) -> int:
     """Return the free bytes of the file system of `path`, which need not exist yet."""
     existing = path.absolute()
-    while not os.path.exists(existing):  # `Path.exists` raises an error for a long name.
+    while not os.path.exists(existing):  # `os.path.exists` raises no error for a long name.
         existing = existing.parent
     return shutil.disk_usage(existing).free
 
@@ -52,7 +52,7 @@ def read_only(path: Path) -> UserError:
         "crossgrad cannot write to this path",
         where=path,
         expected="a folder with write permission",
-        todo="check its permissions, or choose another path",
+        todo="check the permissions of the path, or choose another path",
     )
 
 
@@ -79,7 +79,7 @@ def is_full(error: OSError) -> bool:
 
 @contextmanager
 def disk_errors(path: Path, needed: int | None = None) -> Iterator[None]:
-    """Turn errors about disk space, permissions, file kinds and long paths into a `UserError`.
+    """Convert errors about disk space, permissions, kinds of files and long paths to a `UserError`.
 
     Args:
         path: The file that is being written.
@@ -95,7 +95,7 @@ def disk_errors(path: Path, needed: int | None = None) -> Iterator[None]:
         if error.errno in _IN_THE_WAY:
             what, found = "another file or folder already has this name", error.strerror or ""
             raise UserError(
-                what, where=path, found=found, todo="move it to another path"
+                what, where=path, found=found, todo="move that file or folder to another path"
             ) from error
         if is_too_long(error):
             raise path_too_long(path) from error
@@ -106,8 +106,8 @@ def disk_errors(path: Path, needed: int | None = None) -> Iterator[None]:
 def atomic_file(path: Path, needed: int | None = None) -> Iterator[BinaryIO]:
     """Yield a binary file that replaces `path` when the block ends without an error.
 
-    The bytes reach the disk before the name does, so that a crash leaves either the old file or
-    the new one.
+    The content is on the disk before the file gets its name. Therefore a crash leaves either the
+    complete old file or the complete new file.
 
     Raises:
         UserError: The disk is full or the folder is not writable; an old file stays unchanged.
@@ -133,7 +133,7 @@ def unfinished_name(path: Path) -> Path:
 
 
 def is_leftover(path: Path) -> bool:
-    """Return True for the name of an unfinished file, of a killed process or of a current write."""
+    """Return True if the path has the temporary name of an unfinished file."""
     return _TEMPORARY.fullmatch(path.name) is not None
 
 
@@ -142,8 +142,8 @@ def clear_leftovers(folder: Path, *, shared: bool = False) -> None:
 
     Args:
         folder: The folder.
-        shared: True if other processes may write into the folder; then files of live processes are
-            kept.
+        shared: True if other processes may write into the folder; then files of running processes
+            are kept.
     """
     for path in folder.glob(".*.tmp"):
         named = _TEMPORARY.fullmatch(path.name)
@@ -152,9 +152,9 @@ def clear_leftovers(folder: Path, *, shared: bool = False) -> None:
 
 
 def _is_alive(process: int) -> bool:
-    """Return True if another process of this machine has that number."""
-    # An earlier process with the same number wrote the file. Process numbers repeat in a container,
-    # for example.
+    """Return True if another process of this machine has this process number."""
+    # A file with the number of this process was written by an earlier process. Process numbers
+    # repeat in a container, for example.
     if process == os.getpid():
         return False
     try:
@@ -175,7 +175,7 @@ def text_bytes(text: str) -> bytes:
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a whole file through `atomic_file`."""
+    """Write a file completely or not at all."""
     with atomic_file(path, len(content)) as file:
         file.write(content)
 

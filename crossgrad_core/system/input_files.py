@@ -1,6 +1,7 @@
-"""Input files: only regular files of bounded size are read, so none blocks or fills the memory.
+"""Reading of input files.
 
-Links are followed; docs/reliability.md lists the locations to which names may point.
+Only regular files of limited size are read, so that reading neither blocks nor fills the memory.
+Symbolic links are followed. docs/reliability.md lists the locations to which file names may point.
 """
 
 import os
@@ -21,7 +22,7 @@ _WIDEST: Final = 4
 
 
 def is_file(path: Path) -> bool:
-    """Return True for a regular file or a link to one; False if the name is too long."""
+    """Return True for a regular file or a link to a regular file; False if the name is too long."""
     try:
         return path.is_file()
     except OSError:
@@ -45,8 +46,10 @@ def read_file(path: Path, weights: Mapping[bytes, int] | None = None, most: int 
 
     Args:
         path: The file.
-        weights: Character -> bytes of memory for the value that one occurrence represents.
-        most: Maximum size of the file in bytes; its values may take `GROWS` times as much memory.
+        weights: Character -> bytes of memory that each occurrence of the character adds to the
+            parsed values.
+        most: Maximum size of the file in bytes; the parsed values may take `GROWS` times as much
+            memory.
 
     Raises:
         OSError: The file, or its values in memory, would be too large; see also `open_file`.

@@ -1,7 +1,8 @@
-"""Handling of Ctrl-C, `kill` and a closed terminal: a command ends with one line at any time.
+"""Handling of Ctrl-C, `kill` and a closed terminal: the command prints one line and ends.
 
 The exit code is 128 plus the signal's number, as a shell reports it: 130 after Ctrl-C, 143 after
-SIGTERM, 129 after SIGHUP. The command imports this module first, so this module imports little.
+SIGTERM, 129 after SIGHUP. The command imports this module first, so that a signal during later
+imports is handled.
 """
 
 import os
@@ -17,9 +18,10 @@ SIGNALS = tuple(
 )
 #: Lines that tell the user how to continue after an immediate end. The newest line is last.
 _WAYS_ON: list[str] = []
-#: Files that are being written. They are deleted if the process ends immediately.
+#: Files that are being written. These files are deleted if the process ends immediately.
 UNFINISHED: set[str] = set()
-#: Numbers of the processes that write unfinished files. These processes are ended first.
+#: Numbers of the processes that write unfinished files. These processes are ended before the files
+#: are deleted.
 HELPERS: set[int] = set()
 
 
@@ -29,12 +31,12 @@ def exit_code(number: int) -> int:
 
 
 def signal_names() -> list[int]:
-    """Return the signals that are not ignored; `nohup` and background jobs ignore some."""
+    """Return the signals that are not ignored; `nohup` and background jobs ignore some signals."""
     return [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
 
 
 def tell(text: str, *, alone: bool = True) -> None:
-    """Write one line to stderr; also safe in a signal handler.
+    """Write one line to stderr; a signal handler may call this function.
 
     Args:
         text: The line.
@@ -48,11 +50,11 @@ def tell(text: str, *, alone: bool = True) -> None:
         with suppress(OSError):
             os.write(2, line.encode(errors="backslashreplace"))
     except (OSError, ValueError):
-        pass  # The message cannot be shown anywhere else.
+        pass  # Ignore the error, because the message cannot be shown anywhere else.
 
 
 def end_at_once(number: int, _frame: FrameType | None) -> None:
-    """End the process without unwinding, because a library's callback may swallow an exception."""
+    """End the process without an exception, because library code may suppress exceptions."""
     tell("interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}")
     for line in _WAYS_ON[-1:]:
         tell(line, alone=False)
@@ -70,7 +72,7 @@ def end_at_once(number: int, _frame: FrameType | None) -> None:
 
 @contextmanager
 def resume_hint(text: str) -> Iterator[None]:
-    """Print this line if the process is ended immediately inside the block."""
+    """Print a line of text if a signal ends the process immediately inside the block."""
     _WAYS_ON.append(text)
     try:
         yield

@@ -36,8 +36,8 @@ _TYPES = {
     "float64": "f8",
 }
 _FORMATS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
-# `isdigit` would also accept digits of other scripts. More than 18 digits are refused, because no
-# file contains 10^18 records.
+# Use a pattern, because `isdigit` would also accept digits of other scripts. More than 18 digits
+# are refused, because no file contains 10^18 records.
 _COUNT = re.compile(r"[0-9]{1,18}")
 _LONGEST_HEADER_LINE = 65_536
 _MOST_HEADER_LINES = 10_000
@@ -45,7 +45,7 @@ _MOST_HEADER_LINES = 10_000
 
 @dataclass(frozen=True)
 class Element:
-    """A kind of record of a PLY file; `fields` is None if it has list properties."""
+    """An element of a PLY file; `fields` is None if the element has list properties."""
 
     name: str
     count: int
@@ -77,7 +77,7 @@ class Header:
 
 @dataclass(frozen=True, eq=False)
 class Vertices:
-    """Property name -> [N] column in the file's own type, and the comments of the header."""
+    """The vertices of a PLY file: property name -> [N] column in the file's type, and comments."""
 
     columns: Mapping[str, NDArray[np.generic]]
     comments: tuple[str, ...]
@@ -232,7 +232,8 @@ def _read_binary(
         found = f"{size_text(max(there, 0))} ({max(there, 0):,} bytes)"
         expected = f"{size_text(needed)} ({needed:,} bytes) for {vertex.count:,} vertices"
         raise _truncated(path, expected, found)
-    if dtype.itemsize == 0:  # An element without properties takes no space.
+    # Return no columns, because an element without properties contains no data.
+    if dtype.itemsize == 0:
         return {}
     file.seek(start)
     rows = np.fromfile(file, dtype=dtype, count=vertex.count)

@@ -1,7 +1,8 @@
-"""Progress of a command: a line for each stage, a clock while kernels compile, and counts.
+"""Progress of a command: a line for each stage, and a clock while kernels compile.
 
-This module listens to the package's log. Slow stages write there (`reading scene ...`), and so does
-the kernel cache before it compiles a kernel. This module imports nothing heavy.
+This module shows log messages of the package. Slow stages log a message such as `reading scene
+...`, and the kernel cache logs a message before it compiles a kernel. This module imports no large
+package.
 """
 
 import logging
@@ -26,7 +27,7 @@ _EXPLANATION = "compiling for this machine, only before the first start (about a
 
 
 def announce(*, quiet: bool = False) -> None:
-    """Report at once that the command has started, and from then on its stages.
+    """Report that the command has started, and report its stages until `finish` is called.
 
     Args:
         quiet: Show only warnings.
@@ -49,7 +50,7 @@ def finish() -> None:
 
 
 class _Startup(logging.Handler):
-    """A log handler that shows stages as lines, and compiling with its seconds so far."""
+    """A log handler that shows a line for each stage, and the compilation time so far."""
 
     def __init__(self, level: int) -> None:
         super().__init__(level)
@@ -57,7 +58,7 @@ class _Startup(logging.Handler):
 
     @override
     def emit(self, record: logging.LogRecord) -> None:
-        """Show a record."""
+        """Show a log record."""
         text = record.getMessage()
         if record.levelno >= logging.WARNING:
             _say(f"note: {text}")
@@ -114,7 +115,7 @@ class _Compiling:
         self._seconds = 0.0
 
     def stop(self) -> bool:
-        """End the clock; return True if it was running."""
+        """End the clock; return True if the clock was running."""
         if self._thread is None:
             return False
         self._over.set()
@@ -131,18 +132,18 @@ class _Compiling:
 
 
 def _say(text: str, *, stays: bool = True) -> None:
-    """Write a line; the next line overwrites it unless `stays` is True."""
+    """Write a line; the next line overwrites this line unless `stays` is True."""
     clear = "\r\x1b[K" if is_live(sys.stderr) else ""
     try:
         stream = controls_of(sys.stderr)
         stream.write(f"{clear}{one_line(text)}" + ("\n" if stays else ""))
         stream.flush()
     except (OSError, ValueError):
-        pass  # The reader of the output has closed it.
+        pass  # The program that reads the output has closed the stream.
 
 
 class Progress:
-    """Lines on stderr that begin with three dots, at most one per pause.
+    """A writer of progress lines on stderr that begin with three dots, at most one per pause.
 
     Args:
         pause: Seconds between two lines; 0 shows all lines. The first pause begins immediately.
@@ -154,11 +155,11 @@ class Progress:
 
     @property
     def due(self) -> bool:
-        """True if a line would be shown now; useful if the text is expensive to make."""
+        """True if the pause is over, so that `tell` would show a line now."""
         return monotonic() - self._last >= self._pause
 
     def tell(self, text: str) -> None:
-        """Show a line if one is due."""
+        """Show a line if the pause is over."""
         if self.due:
             self._last = monotonic()
             sys.stderr.write(f"... {one_line(text)}\n")

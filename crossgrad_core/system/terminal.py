@@ -10,10 +10,10 @@ from crossgrad_core.wording import showable
 
 
 class PlainText(io.TextIOWrapper):
-    """A text stream that writes control characters as escapes, as Python does in a string.
+    """A text stream that writes control characters as escape sequences of Python strings.
 
     Otherwise a name from a file could move the cursor or change the colours of the terminal. Code
-    that needs to move the cursor writes to `controls_of` the stream.
+    that moves the cursor writes to the stream that `controls_of` returns.
     """
 
     def __init__(self, buffer: io.BufferedWriter, **options: Any) -> None:  # noqa: ANN401
@@ -27,7 +27,7 @@ class PlainText(io.TextIOWrapper):
 
 
 class _Controls:
-    """The same stream, without escaping control characters."""
+    """A wrapper of a `PlainText` stream that writes control characters unchanged."""
 
     def __init__(self, stream: PlainText) -> None:
         self._stream = stream
@@ -63,5 +63,6 @@ def is_live(stream: TextIO) -> bool:
         return False
     try:
         return os.get_terminal_size(stream.fileno()).columns > 0
-    except (OSError, ValueError):  # The terminal does not report its size.
+    # Assume that a terminal without a known size can overwrite lines.
+    except (OSError, ValueError):
         return True

@@ -1,4 +1,4 @@
-"""CSV and JSON files: reading with one error for every fault, and atomic writing of CSV tables."""
+"""Functions that read CSV and JSON files and write CSV tables."""
 
 import csv
 import io
@@ -12,12 +12,13 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.system.files import text_bytes, write_atomically
 from crossgrad_core.system.input_files import LARGEST, read_file
 
-# `int` and `float` also accept digits of other scripts, digit groups and spaces.
+# Check numbers with a pattern, because `int` and `float` also accept digits of other scripts, digit
+# groups and spaces.
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?inf|nan", re.ASCII)
 _LONGEST_NUMBER = 400
-# Bytes of memory for each character of a file. CSV: a line end adds a list, a comma adds a cell.
-# JSON: `[` adds a list, `{` adds an object with one member, and `,` and `:` add a value with its
-# position or key.
+# Estimated bytes of memory for each of these characters in a file. In CSV, each line end stands for
+# a list, and each comma for a cell. In JSON, each `[` stands for a list, each `{` for an object,
+# and each `,` or `:` for a value.
 _CSV = {b"\n": 160, b"\r": 160, b",": 60}
 _JSON = {b"[": 96, b"{": 240, b",": 64, b":": 64}
 
@@ -55,7 +56,7 @@ def read_json(path: Path, most: int = LARGEST) -> object:
         most: Maximum size of the file in bytes.
 
     Raises:
-        FileNotFoundError: There is no such file.
+        FileNotFoundError: The file does not exist.
         ValueError: The file cannot be read, is too large or too deeply nested, or is not JSON.
     """
     try:
@@ -70,7 +71,7 @@ def read_json(path: Path, most: int = LARGEST) -> object:
 
 
 def parse_number(text: str) -> int | float:
-    """Return a whole number as int, any other number as float.
+    """Return the number in a text as int if it is a whole number, else as float.
 
     Raises:
         ValueError: The text is not a number, or has too many digits.
@@ -84,9 +85,9 @@ def parse_number(text: str) -> int | float:
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, str | int | float]]) -> None:
-    """Write rows with the union of their columns, in the order of their first occurrence.
+    """Write rows as a CSV table with all columns of the rows, in the order of first occurrence.
 
-    Numbers have nine significant digits. NaN and missing cells become empty cells.
+    Floating-point numbers have nine significant digits. NaN and missing cells become empty cells.
 
     Raises:
         UserError: The disk is full, or the folder is read-only.
@@ -102,7 +103,7 @@ def table_bytes(rows: Sequence[Mapping[str, str | int | float]]) -> bytes:
 
 
 def csv_bytes(lines: Iterable[Iterable[str]]) -> bytes:
-    """Return lines of cells as in a file: UTF-8, commas, a line feed after each line."""
+    """Return lines of cells as CSV bytes: UTF-8, commas, and a line feed after each line."""
     rows = _Rows()
     # With this line end, the writer quotes cells that contain a carriage return or a line feed.
     csv.writer(rows, lineterminator="\r\n").writerows(lines)
@@ -110,14 +111,14 @@ def csv_bytes(lines: Iterable[Iterable[str]]) -> bytes:
 
 
 class _Rows(list[str]):
-    """The rows that a `csv.writer` writes, collected one by one."""
+    """A list of the rows that a `csv.writer` writes."""
 
     def write(self, row: str) -> None:
         self.append(row)
 
 
 def as_cell(value: float | str | None) -> str:
-    """Return a value with all its digits; an empty cell for None."""
+    """Return the text of a CSV cell: a value with all its digits, or nothing for None."""
     return "" if value is None else str(value)
 
 

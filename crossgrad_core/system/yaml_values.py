@@ -1,9 +1,9 @@
-"""YAML as users expect it: `1e-3` is a number, `no` is a word, and a repeated key is an error.
+"""Functions that read and write YAML 1.2: `1e-3` is a number, and `no` is a word.
 
 PyYAML follows YAML 1.1, where `1e-3` is a string, `no` is false and `12:30` is 750. PyYAML also
-builds values without limits: very long numbers, lists nested until the stack is full, and, through
-aliases, a billion copies of one list from a few hundred bytes. This module builds the values from
-PyYAML's parse tree, with bounds on their number and depth.
+sets no limits on the length of numbers and on the depth of lists. With aliases, a file of a few
+hundred bytes can contain a billion copies of one list. This module builds the values from PyYAML's
+parse tree and limits their number and depth. A repeated key is an error.
 """
 
 import re
@@ -20,8 +20,8 @@ from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from crossgrad_core.errors import UserError
 from crossgrad_core.system.input_files import open_file
 
-#: Limits of a YAML text: bytes, number of values (an alias counts as often as the value that it
-#: copies), and nesting depth of lists. The last limit is the number of digits of a number.
+#: Limits of a YAML text: number of bytes, number of values, nesting depth of lists and mappings,
+#: and number of digits of a number. Each alias counts like the values that it copies.
 MOST_BYTES: Final = 1 << 18
 MOST_VALUES: Final = 10_000
 DEEPEST: Final = 32
@@ -38,7 +38,8 @@ _FLOAT = re.compile(
 )
 _NULL = re.compile(r"^(?:~|null|Null|NULL|)$")
 _LINE_ENDS = re.compile("[\r\n\x85\u2028\u2029]")
-# Bytes of a file name that are not UTF-8 are \udc80 to \udcff.
+# The characters \udc80 to \udcff are allowed, because they represent bytes of file names that are
+# not UTF-8.
 _IMPOSSIBLE = re.compile("[\0\ud800-\udc7f\udd00-\udfff]")
 
 
@@ -66,7 +67,7 @@ class _Loader(yaml.SafeLoader):
 
 
 class _Dumper(yaml.SafeDumper):
-    """A dumper that quotes words to which YAML 1.1 or 1.2 gives another meaning."""
+    """A dumper that quotes words which YAML 1.1 or 1.2 would not read as strings."""
 
     @override
     def ignore_aliases(self, data: object) -> bool:
@@ -74,7 +75,8 @@ class _Dumper(yaml.SafeDumper):
 
 
 def _represented(dumper: _Dumper, text: str) -> ScalarNode:
-    # In other styles, PyYAML writes Unicode line ends unescaped and reads them as spaces.
+    # Use double quotes for text with line ends, because PyYAML otherwise writes Unicode line ends
+    # unescaped and reads these line ends as spaces.
     style = '"' if _LINE_ENDS.search(text) else None
     return dumper.represent_scalar(f"{_TAG}str", text, style)
 
@@ -91,11 +93,11 @@ for _class in (_Loader, _Dumper):
 
 
 def read_yaml(text: str) -> object:
-    """Return the value of a YAML text: plain data in which no two parts are the same object.
+    """Return the value of a YAML text as plain data; aliases become copies.
 
     Raises:
-        yaml.YAMLError: The text is not YAML, is larger than a run's settings can be, contains a key
-            twice, or contains a value that a setting cannot have.
+        yaml.YAMLError: The text is not YAML, exceeds a limit, contains a key twice, or contains a
+            value that a setting cannot have.
     """
     if len(text) > MOST_BYTES:
         raise yaml.YAMLError(f"the file is larger than {MOST_BYTES // 1024} KiB")
@@ -111,7 +113,7 @@ def read_yaml(text: str) -> object:
 
 
 def read_mapping(path: Path, what: str, todo: str) -> dict[str, Any]:
-    """Return the mapping in a YAML file, read like a configuration file; empty for an empty file.
+    """Return the mapping in a YAML file; an empty file gives an empty mapping.
 
     Args:
         path: The file.
@@ -144,7 +146,7 @@ def read_mapping(path: Path, what: str, todo: str) -> dict[str, Any]:
 
 
 def described(error: yaml.YAMLError) -> str:
-    """Describe the fault in a YAML text in one line, with its position."""
+    """Return one line about an error in a YAML text, with the position of the error."""
     if not isinstance(error, yaml.MarkedYAMLError):
         return " ".join(str(error).split())
     text = ", ".join(phrase for phrase in (error.context, error.problem) if phrase)
@@ -159,7 +161,7 @@ def write_yaml(settings: Mapping[str, Any]) -> str:
 
 
 class _Values:
-    """A builder of plain data from nodes; aliases are copied, and every copy counts."""
+    """A builder of plain data from nodes; the values of aliases are copied and count again."""
 
     def __init__(self) -> None:
         self._count = 0
@@ -209,14 +211,14 @@ def _integer(text: str) -> int:
 
 
 def _float(text: str) -> float:
-    # YAML's `.inf` is `inf` in Python.
+    # Remove the dot, because YAML's `.inf` is `inf` in Python.
     value = float(text.replace(".", "", 1) if text.lower().endswith((".inf", ".nan")) else text)
     if isnan(value):
-        raise ValueError("a value is NaN, which no setting can be")
+        raise ValueError("a value is NaN, which is not allowed in settings")
     return value
 
 
-#: Name of a tag -> pattern of its values, and the function that builds them.
+#: Name of a YAML tag -> pattern of valid values, and the function that builds a value.
 _SCALARS: Final[dict[str, tuple[re.Pattern[str], Callable[[str], object]]]] = {
     "str": (re.compile("", re.DOTALL), _word),
     "null": (_NULL, lambda _: None),

@@ -139,7 +139,7 @@ def test_captures_that_cannot_be_compared_are_refused(trained, scene, tmp_path):
         evaluate.evaluate(trained, on=only)
     away = {**PLACE, "offset": (4000.0, -20.0, 3.0)}
     far_away = write_tiny_scene(tmp_path / "away", views=3, **away)
-    with pytest.raises(UserError, match=r"does not overlap(.|\n)*0% of its points"):
+    with pytest.raises(UserError, match=r"does not overlap(.|\n)*0% of the capture's points"):
         evaluate.evaluate(trained, on=far_away)
     with pytest.raises(UserError):
         evaluate.evaluate(trained, on=tmp_path / "nothing")
@@ -191,6 +191,6 @@ def test_captures_of_one_place_are_distinguished_from_captures_of_another_place(
 def test_a_capture_of_another_place_is_measured_with_a_warning(trained, scene, capsys, monkeypatch):
     monkeypatch.setattr(elsewhere_module, "_alike", lambda own, points: False)
     evaluate.evaluate(trained, on=scene)
-    assert "both show the same place" in capsys.readouterr().out
+    assert "the run show the same place" in capsys.readouterr().out
     render.render(trained, split="test", out=None, on=scene)
-    assert "both show the same place" in capsys.readouterr().out
+    assert "the run show the same place" in capsys.readouterr().out

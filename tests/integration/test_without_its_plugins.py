@@ -63,8 +63,8 @@ def test_a_run_can_be_evaluated_without_the_plugins_that_trained_it(run, capsys)
     assert ended("eval", run) == 0
     told = capsys.readouterr().err
     assert (
-        "not installed here, so they are not used: sampler own-samplers, operator own-operators"
-        in told
+        "components that are not installed here are not used: sampler own-samplers, "
+        "operator own-operators" in told
     )
     assert "metrics gains, observers listens" in told
     assert (run / "per_view.csv").read_text() == before

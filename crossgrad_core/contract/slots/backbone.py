@@ -22,11 +22,11 @@ class Backbone(Component):
     """A trained representation: parameters in named blocks, decoded to Gaussians for a camera.
 
     Attributes:
-        default_densifier: Name of the densifier that is used unless the user names another. A
+        default_densifier: Name of the densifier that is used if the user names no densifier. A
             recipe may choose another densifier, for example in short runs of many photos.
-        response: How the Gaussians of the backbone fill a pixel.
+        response: Formula of a Gaussian's opacity in a pixel.
         plain: True if the backbone decodes to the same plain Gaussians for every camera, so that a
-            standard PLY loses nothing.
+            standard PLY file contains the complete model.
         sets_dilation: True if the backbone's Gaussians set their own dilation, regardless of the
             rasterizer's dilation.
         passthrough: Field of the Gaussians -> tensor. `decode` returns the tensor unchanged as this
@@ -34,14 +34,15 @@ class Backbone(Component):
             of the tensor need to be up to date. Subclasses do not inherit this value.
         positions: Name of the tensor [N, 3] of the primitives' positions in the local frame. Before
             the first step and after steps with edits, the primitives are sorted in memory by
-            position: all rows of all per-primitive tensors are sorted together, and `prepare` is
-            not called. At the end of a run, the rows of floaters may be removed in the same way.
-            Before this, `decode` is called with some of the rows only. If the name is empty, only
-            edits move or remove rows.
-        axes: Names of two tensors, if each primitive is one Gaussian at its position: [N, 3]
-            logarithms of standard deviations and [N, 4] rotations (wxyz, of any length). Positions
-            may then be updated along these axes, and the deviations may be bounded. Empty if
-            primitives are not Gaussians. Subclasses do not inherit this value.
+            position. The rows of all per-primitive tensors are sorted together, and `prepare` is
+            not called. At the end of a run, the rows of floaters may be removed from all these
+            tensors. To find floaters, `decode` is called with some of the rows only. If the name is
+            empty, only edits move or remove rows.
+        axes: Names of two tensors if each primitive is one Gaussian at its position; empty
+            otherwise. The first tensor [N, 3] contains logarithms of standard deviations. The
+            second tensor [N, 4] contains rotations (quaternions wxyz of any length). Positions may
+            then be updated along the axes of the Gaussians, and the standard deviations may be
+            bounded. Subclasses do not inherit this value.
     """
 
     slot: ClassVar[str] = "backbones"
@@ -56,16 +57,18 @@ class Backbone(Component):
     @classmethod
     @override
     def __pydantic_init_subclass__(cls, **kwargs: object) -> None:
-        # The `decode` of a subclass may read a tensor that its parent only passes through.
+        # Do not inherit `passthrough`, because the `decode` of a subclass may read a tensor that
+        # the parent's `decode` does not read.
         if "passthrough" not in vars(cls):
             cls.passthrough = {}
-        # A subclass may store sizes and rotations in another way.
+        # Do not inherit `axes`, because a subclass may store standard deviations and rotations in
+        # another form.
         if "axes" not in vars(cls):
             cls.axes = ()
 
     @abstractmethod
     def blocks(self) -> tuple[Block, ...]:
-        """Return the blocks, which never change during the life of the component."""
+        """Return the blocks, which are the same at every call."""
 
     @abstractmethod
     def create(self, scene: Scene, rng: np.random.Generator) -> Parameters:
@@ -92,13 +95,13 @@ class Backbone(Component):
 
     @property
     def learns_scales(self) -> bool:
-        """True if Gaussians with axes learn their scales, so that the scales can be bounded."""
+        """True if the primitives are Gaussians with axes whose scales are trained."""
         names = self.gaussian_tensors
         learning = (block for block in self.trained_blocks() if block.lr.initial > 0.0)
         return names is not None and any(names[1] in block.tensors for block in learning)
 
     def fitted_to(self, scene: Scene) -> tuple["Backbone", tuple[str, ...]]:
-        """Return this backbone without options that the scene does not need, and notes on it.
+        """Return this backbone without options that the scene does not need, and messages.
 
         Options that the user set are never changed.
         """
@@ -145,6 +148,6 @@ class Backbone(Component):
     ) -> Gaussians:
         """Return plain SH Gaussians without a graph, for a standard PLY.
 
-        View-dependent values are baked for `cameras` (one or more): as an average, or by a rule of
-        the backbone.
+        View-dependent values are evaluated for `cameras` (one or more). Each backbone either
+        averages these values or combines them by its own rule.
         """

@@ -1,4 +1,4 @@
-"""The densifier slot: screen statistics are used to clone, split, grow, relocate and prune."""
+"""The densifier slot: a component clones, splits, grows, relocates and prunes primitives."""
 
 from abc import abstractmethod
 from typing import ClassVar
@@ -21,8 +21,9 @@ class Densifier(Component):
         tensors: Names of the parameter tensors that the backbone must provide.
         edits: True if the densifier ever edits the set of primitives.
         resets: True if the densifier resets opacities when the schedule requires it.
-        reset_options: Options that have an effect only in runs with resets. A subclass that also
-            reads one of these inherited options in other runs must change this set.
+        reset_options: Options that have an effect only in runs with opacity resets. A subclass that
+            reads such an inherited option in runs without resets must remove the option from this
+            set.
         observes: True if the densifier collects statistics of the views that the steps render.
         budgeted: True if growth follows a budget of Gaussians that depends on the length of the
             run, unless the user sets a bound.
@@ -38,7 +39,9 @@ class Densifier(Component):
     budgeted: ClassVar[bool] = False
 
     def window(self, schedule: Schedule) -> Schedule:
-        """Return the schedule with the edit times of this method; the user's settings override it.
+        """Return the schedule with the edit times of this densifier.
+
+        The user's settings override these times.
 
         Args:
             schedule: The schedule of the run, with the times of 3DGS.
@@ -46,23 +49,22 @@ class Densifier(Component):
         return schedule
 
     def started(self, parameters: Parameters) -> Parameters:
-        """Return the initial parameters with the changes of this method; by default unchanged."""
+        """Return the initial parameters as this densifier changes them; by default unchanged."""
         return parameters
 
     @abstractmethod
     def densify(self, context: DensifyContext, state: PluginState) -> tuple[Edit, PluginState]:
         """Return the edit of this step and the new state.
 
-        An edit must keep at least a tenth of the primitives of a model that trains well, because a
-        model does not recover from the loss of nearly all primitives.
+        An edit must keep at least a tenth of the primitives of a model that trains well. A model
+        does not recover from the loss of nearly all primitives.
 
-        The core gathers the rows of `state.per_primitive` of *the returned state* together with the
-        edit.
+        The core applies the edit to the rows of `per_primitive` in the *returned* state, too.
         """
 
     @hookimpl
     def crossgrad_densify(self, context: DensifyContext) -> DensifyResult:
-        """Implement the hook with the edit of this densifier."""
+        """Return this densifier's result for the hook."""
         answer = self.densify(context, context.state(STATE))
         edit, state = with_state(answer, Edit, self, "densify")
         return DensifyResult(edit, states={STATE: state})

@@ -1,4 +1,4 @@
-"""The exposure slot: a model of the camera's exposure between the render and its photo."""
+"""The exposure slot: a component models the camera's exposure of each photo."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
@@ -37,8 +37,7 @@ class Fitted:
 
     Attributes:
         exposure: The exposure that the run uses.
-        name: Name under which this exposure is installed; None if the run keeps the configured
-            exposure.
+        name: Installed name of `exposure`; None if the run uses the configured exposure.
         notes: The decision on the exposure, and the evidence for it.
     """
 
@@ -52,8 +51,9 @@ class Exposure(Component):
 
     The parameters of an exposure belong to photos, not to the scene, so operators do not receive
     their gradients. After each step, the values of each photo in this step are updated by a
-    separate Adam step with its own step count. This holds for any number of views and every
-    backbone. Then the values of all photos are projected. Checkpoints contain the values.
+    separate Adam step with its own step count. The separate step is the same for any number of
+    views and every backbone. After the separate step, `project` limits the values of all photos.
+    Checkpoints contain the values.
     """
 
     slot: ClassVar[str] = "exposures"
@@ -95,25 +95,25 @@ class Exposure(Component):
         return values
 
     def shift(self, name: str, values: Tensor, start: Tensor, end: Tensor) -> Tensor:
-        """Return the values [P, ...] of a parameter, all changed as from `start` to `end`.
+        """Return the values [P, ...] of a parameter, shifted by the change from `start` to `end`.
 
-        By default `end - start` is added to every value. This moves the values of all photos to the
-        level of the values in a file, and keeps the differences between photos.
+        By default `end - start` is added to every value, so the differences between photos do not
+        change. The shift adapts the values of all photos to values that the user gives in a file.
         """
         return values + (end - start)
 
     def predict_unseen(
         self, view: View, scene: Scene, values: Mapping[str, Tensor]
     ) -> Mapping[str, Tensor]:
-        """Return the values of a view that is not used for training, without reading its pixels.
+        """Return the exposure values of a view without a training photo; do not read its pixels.
 
-        By default, each value is the mean over the training photos of the view's regime, or over
-        all training photos if the regime contains none.
+        By default, each value is the mean over the training photos of the view's regime. If the
+        regime contains no training photo, the mean is over all training photos.
 
         Args:
             view: The view.
             scene: The scene.
-            values: Name -> [P, ...] of the training photos.
+            values: Name -> values [P, ...] of the training photos.
         """
         regimes = [photo.regime for photo in scene.train_views]
         rows = [row for row, regime in enumerate(regimes) if regime == view.regime]

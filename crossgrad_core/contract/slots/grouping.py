@@ -15,7 +15,7 @@ from crossgrad_core.contract.scene import Scene, View
 
 @dataclass(frozen=True, eq=False)
 class GroupingRule:
-    """A grouping after its fit to the training cameras of a scene.
+    """The rule that results when a grouping is fitted to the training cameras of a scene.
 
     Attributes:
         labels: Function from views of the scene to their labels, one per view, in the same order.
@@ -36,8 +36,8 @@ class Quantity:
 
     Attributes:
         name: Description of the quantity, such as "the log distance from the mean camera".
-        values: [V] float64 in the order of the given views; a value is not finite if the quantity
-            is undefined for a view.
+        values: [V] float64 in the order of the given views; NaN or infinity if the quantity is
+            undefined for a view.
     """
 
     name: str
@@ -63,8 +63,7 @@ class Grouping(Component):
     Attributes:
         labels: Every label that the rule can give, near first; empty if the user's input defines
             the labels.
-        needs_probe: True if the rule reads gradients and cannot label views without a
-            `GradientProbe`.
+        needs_probe: True if the rule needs gradients and therefore requires a `GradientProbe`.
     """
 
     slot: ClassVar[str] = "groupings"
@@ -88,13 +87,14 @@ class Grouping(Component):
         """
 
     def quantity(self, scene: Scene, views: Sequence[View]) -> Quantity | None:
-        """Return the quantity that the rule splits; a run reports if it has a single mode.
+        """Return the quantity by which the rule splits the views.
 
         Args:
             scene: The scene.
-            views: The views to be measured.
+            views: The views whose quantity is returned.
 
-        Returns: None (the default) for rules that use more than one number per view.
+        A run reports if the distribution of the quantity has a single mode. Returns: None (the
+        default) for rules that use more than one number per view.
         """
         return None
 

@@ -19,8 +19,8 @@ class MorePoints:
         positions: [N, 3] float64, local frame.
         colors: [N, 3] uint8 RGB.
         sizes: [N] float64, local units: standard deviation of the Gaussian of a point, if the
-            backbone makes Gaussians from points. NaN selects the distance to the neighbours, as for
-            the points of the scene.
+            backbone makes Gaussians from points. NaN selects a size from the distance to the
+            neighbours, as for the points of the scene.
         opacities: [N] float64 in (0, 1): opacity of the Gaussian of each point. NaN selects the
             value of the backbone.
     """
@@ -37,8 +37,8 @@ class Initializer(Component):
     An initializer is used only in runs that start from the scene's own points (`--init points`).
 
     Attributes:
-        alone: True if the initializer can make points for a scene without points. An initializer
-            raises an error if it finds no points in such a scene.
+        alone: True if the initializer can make points for a scene without points. In a scene
+            without points, the initializer must then make points or raise an error.
     """
 
     slot: ClassVar[str] = "initializers"

@@ -17,11 +17,11 @@ from crossgrad_core.contract.scene import View
 class Compared:
     """A held-out view with the render and the photo that a metric compares.
 
-    Metrics must not change any of its contents.
+    Metrics must not change this object or its tensors.
 
     Attributes:
         view: The view.
-        render: [H, W, 3] uint8 on the CPU, rounded as if it had been written to a file.
+        render: [H, W, 3] uint8 on the CPU, rounded as in an image file.
         photo: [H, W, 3] uint8.
         mask: [H, W] bool, True where the pixel counts; None if every pixel counts.
         drawn: [H, W, 3] floating point on the CPU, the render before clamping and rounding; None if

@@ -10,8 +10,8 @@ class Observer(Component):
 
     An observer must not end a run: it catches its own errors. An observer changes the model through
     hook results only, and returns finite numbers for finite inputs. An observer stores at most 0.1
-    MB per step in memory. On a small scene, each of its calls delays a step by less than 0.1 s. The
-    time of events does not count as training time.
+    MB of memory per step. On a small scene, each call of an observer takes less than 0.1 s. The
+    time of event hooks does not count as training time.
 
     Attributes:
         needs_separate_gradients: True if the observer reads the gradients of single views. The run

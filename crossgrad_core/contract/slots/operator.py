@@ -20,10 +20,11 @@ class Operator(Component):
 
     Attributes:
         separate: True if the operator needs the separate gradients of the views. Otherwise the
-            backward passes accumulate one gradient, which has the same bits and needs no copies.
+            backward passes accumulate one gradient, which is bitwise equal to the sum of the
+            separate gradients and needs no copies.
         views: Supported values of K.
         identity_at_one: True if the operator returns the gradient of a single view unchanged. A run
-            with K = 1 then reports that the operator does nothing.
+            with one view per step then reports that the operator has no effect.
         default_grouping: Name of the grouping that is used if the user names none; None if the
             operator needs no labels.
         sparse_rows: True if `aggregate` returns the results of `total` and `combine` unchanged,
@@ -55,7 +56,7 @@ class Operator(Component):
         return views == 1 and self.identity_at_one
 
     def needs_more_views(self, views: int) -> bool:
-        """Return True if the operator, or an operator in it, does nothing with `views` views."""
+        """Return True if the operator, or an operator in it, has no effect with `views` views."""
         return self.is_identity(views)
 
     def reads_labels(self) -> bool:
@@ -68,8 +69,9 @@ class Operator(Component):
     ) -> tuple[AggregateResult, PluginState]:
         """Return one gradient per tensor, and the new state.
 
-        The result must not depend on the positions of the views in the step, only on labels,
-        losses, distances and gradients. Views that agree in all four must have equal weight.
+        The result must not depend on the order of the views in the step. The result may depend only
+        on labels, losses, distances and gradients. Views with equal labels, losses, distances and
+        gradients must have equal weights.
 
         Args:
             context: The gradients of the K views and further data of the views.
@@ -78,7 +80,7 @@ class Operator(Component):
 
     @hookimpl
     def crossgrad_aggregate_gradients(self, context: AggregateContext) -> AggregateResult:
-        """Implement the hook with the gradients of this operator."""
+        """Return this operator's result for the hook."""
         answer = self.aggregate(context, context.state(STATE))
         aggregated, state = with_state(answer, AggregateResult, self, "aggregate")
         states: Mapping[str, PluginState] = {**aggregated.states, STATE: state}

@@ -14,19 +14,21 @@ from crossgrad_core.contract.scene import Camera
 
 
 class Rasterizer(Component):
-    """A renderer of Gaussians that follows one common rule set (see docs/rasterizers.md).
+    """A renderer of Gaussians that follows the common rules in docs/rasterizers.md.
 
     Attributes:
-        max_alpha: Cap of a Gaussian's alpha (0.99 as in 3DGS and gsplat 1.6; 0.999 in gsplat 1.5).
+        max_alpha: Upper limit of a Gaussian's alpha (0.99 as in 3DGS and gsplat 1.6; 0.999 in
+            gsplat 1.5).
         near: Camera depth in local units; Gaussians with a nearer centre are not drawn.
-        dilation: Added to both diagonal entries of the 2-D covariance, px^2.
+        dilation: Number that is added to both diagonal entries of the 2-D covariance, px^2.
         provides: Optional outputs that the rasterizer can compute: `depth`, `pixels`,
             `abs_gradient`, `directions`, `count`.
-        responses: Pixel responses that the rasterizer supports.
-        devices: Torch device types that it supports.
+        responses: Values of `Gaussians.response` that the rasterizer supports.
+        devices: Torch device types that the rasterizer supports.
         batched: True if `render_views` is faster than single renders. The views of a step are then
-            rendered in one call, and the graphs of all views are in memory together.
-        deterministic: True if the same input gives the same bits.
+            rendered in one call, and the autograd graphs of all views are in memory at the same
+            time.
+        deterministic: True if equal inputs give bitwise equal results.
         sparse_rows: True if the rasterizer supports `Gaussians.on_demand`; subclasses do not
             inherit this value.
     """
@@ -46,7 +48,8 @@ class Rasterizer(Component):
     @classmethod
     @override
     def __pydantic_init_subclass__(cls, **kwargs: object) -> None:
-        # A subclass may read Gaussians before its parent requests their rows.
+        # Do not inherit `sparse_rows`, because a subclass may read rows of Gaussians before its
+        # parent class requests an update of these rows.
         if "sparse_rows" not in vars(cls):
             cls.sparse_rows = False
 
@@ -55,8 +58,8 @@ class Rasterizer(Component):
         """Return a speed rank on a device; `--rasterizer auto` chooses the highest rank.
 
         The ranks are 1 for the readable reference, 10 for compiled kernels on a CPU, 100 on a GPU.
-        `auto` never chooses rank 0: the rasterizer does not support the device, or the user must
-        name it.
+        Rank 0 means that `auto` never chooses the rasterizer. Then the rasterizer does not support
+        the device, or the user must choose it by name.
 
         Args:
             device: Torch device type.
@@ -67,8 +70,8 @@ class Rasterizer(Component):
     def missing(cls, device: str) -> str:  # noqa: ARG003 - subclasses use the argument
         """Return the missing requirements for a device on this machine, and how to install them.
 
-        Empty if nothing is missing, or if the rasterizer does not support the device. `--device
-        auto` shows this text if the machine has a GPU that no rasterizer uses.
+        The text is empty if nothing is missing, or if the rasterizer does not support the device.
+        `--device auto` shows this text if the machine has a GPU that no rasterizer uses.
 
         Args:
             device: Torch device type.
@@ -108,8 +111,8 @@ class Rasterizer(Component):
         """Render several views, each with its own Gaussians and background [3].
 
         The results equal the results of `render`. By default the views are rendered one after
-        another; a rasterizer for a GPU may render them together. The backward pass for all views is
-        one call.
+        another. A rasterizer for a GPU may render all views in one call. One backward call then
+        serves all views.
         """
         return [
             self.render(gaussians, camera, background, outputs)

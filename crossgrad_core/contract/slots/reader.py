@@ -19,10 +19,10 @@ class Reader(Component):
         """Return True if the folder seems to be in a format that this reader can read."""
 
     def nearly_accepts(self, path: Path) -> bool:
-        """Return True if a file in the folder is nearly in this reader's format.
+        """Return True if a file in the folder has almost the format of this reader.
 
-        This method is called only if no reader accepts the folder. If it returns True, `read`
-        reports what is missing.
+        This method is called only if no reader accepts the folder. If the result is True, the error
+        message of `read` reports what is missing.
         """
         return False
 

@@ -27,20 +27,20 @@ class Facts:
     Attributes:
         device: Torch device type.
         planned: Planned number of steps; None while only the time budget is known.
-        total: Present number of steps. It differs from `planned` if a time budget made the run
-            longer or shorter.
+        total: Present number of steps. The number differs from `planned` if a time budget made the
+            run longer or shorter.
         mode: `scaled` if the published schedule is stretched to the run, else `absolute`.
-        schedule_length: Length that the schedule is written for. None stands for the length of the
-            run, or for the published length.
-        views_per_step: Views of each step, K.
-        views_because: Why K is not the default of the sampler; empty if it is the default.
+        schedule_length: Length for which the schedule is written. If None, a scaled schedule uses
+            the length of the run, and an absolute schedule uses the published length.
+        views_per_step: Number of views of each step, K.
+        views_because: Reason why K differs from the sampler's default; empty if K is the default.
         photos: Number of training photos.
-        pixels: Pixels of a training photo, mean.
+        pixels: Mean number of pixels of a training photo.
         photos_per_point: Median number of training photos that show an SfM point; 0 without points.
         own_points: True if the run starts from the points of the scene.
-        batched: True if a batch rule scales learning rates and Adam's averages with K.
+        batched: True if learning rates and Adam's decay rates are scaled with K.
         scale: Local units per unit of the scene's input frame.
-        start: Primitives at the start; None before they are counted.
+        start: Number of primitives at the start; None before they are counted.
         backbone: The backbone, fitted to the scene.
         densifier: Name -> the densifier of this name with the options that the user set.
         provides: Screen statistics that the rasterizer of the run provides.
@@ -68,25 +68,25 @@ class Facts:
 
     @property
     def published(self) -> bool:
-        """True if the schedule uses the published numbers, whatever the length of the run."""
+        """True if the schedule uses the published numbers in a run of any length."""
         return is_published(self.mode, self.schedule_length)
 
     @property
     def unit(self) -> Unit:
-        """The unit that schedules count in, unless the recipe decides otherwise."""
+        """The unit in which the schedule counts, unless the recipe chooses another unit."""
         unit: Unit = self.given.get("schedule_unit") or ("steps" if self.published else "views")
         return unit
 
     @property
     def steps(self) -> int | None:
-        """Planned steps; with `--schedule absolute`, the steps that the schedule is written for."""
+        """Planned steps; with `--schedule absolute`, the number of steps of the schedule."""
         schedule = self.schedule(self.unit)
         if self.mode == "absolute":
             return schedule.step_of(schedule.length)
         return self.planned
 
     def intervals(self) -> list[Decision]:
-        """Return the intervals of evaluations and checkpoints as rows; they change no result."""
+        """Return the decisions on the intervals of evaluations and checkpoints."""
         steps = self.planned or self.total
         return [
             Decision("eval_every", max(1, steps // 10), "a tenth of the run"),
@@ -105,7 +105,7 @@ class Facts:
         return self.views is None or self.views < REFERENCE
 
     def schedule(self, unit: Unit) -> Schedule:
-        """Return the schedule at the present length of the run, before any decision about it."""
+        """Return the schedule for the present length of the run, without the recipe's decisions."""
         counting = Counting(unit, self.views_per_step, self.photos, self.schedule_length)
         return Schedule.for_run(self.total, self.mode, counting)
 
@@ -116,7 +116,8 @@ class Recipe(Component):
     Attributes:
         settings: Settings that the recipe fixes before any fact is known, such as the sampler and
             the length. The user's settings override these settings.
-        rasterizer_options: Options that a rasterizer must support to be chosen for this recipe.
+        rasterizer_options: Options that `--rasterizer auto` requires of a rasterizer for this
+            recipe.
     """
 
     slot: ClassVar[str] = "recipes"
@@ -125,10 +126,10 @@ class Recipe(Component):
 
     @abstractmethod
     def decide(self, facts: Facts) -> list[Decision]:
-        """Return one row for each setting; rows of settings that the user set are ignored."""
+        """Return one decision for each setting; decisions on settings of the user are ignored."""
 
 
 def with_rows(rows: Iterable[Decision], others: Sequence[Decision]) -> list[Decision]:
-    """Merge rows: a row of `others` replaces the row of its setting in `rows`, or is appended."""
+    """Return `rows`, updated by `others`: a row replaces the row of its setting or is appended."""
     table = {row.setting: row for row in rows}
     return [*(table | {row.setting: row for row in others}).values()]

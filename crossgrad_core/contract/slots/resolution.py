@@ -31,9 +31,9 @@ class Resolution(Component):
     statistics in units of the full photo.
 
     Attributes:
-        strided: True if a view of scale 1 / n is rendered at one pixel of each n x n block instead,
-            and compared with these pixels of its photo. The rendered pixel of a block differs from
-            step to step.
+        strided: True if a view of scale 1 / n is rendered at one pixel of each n x n block of the
+            full-size image. The loss compares these pixels with the same pixels of the photo. The
+            rendered pixel of a block differs from step to step.
     """
 
     slot: ClassVar[str] = "resolutions"
@@ -51,9 +51,9 @@ class Resolution(Component):
         return ()
 
     def pixels(self, schedule: Schedule, step: int) -> float:
-        """Return the pixels that all steps up to this step render, in numbers of full photos.
+        """Return the number of pixels rendered until the end of a step, in units of one full photo.
 
-        Time budgets use this number for planning. By default all views have their full size.
+        Time budgets use this number for planning. By default all views are rendered at full size.
         """
         return schedule.pace.views(step)
 
@@ -63,12 +63,12 @@ class Resolution(Component):
     ) -> tuple[tuple[float, ...], PluginState]:
         """Return one scale in (0, 1] for each view of `context.draw`, and the new state.
 
-        Random numbers come from `context.rng`.
+        Random numbers must come from `context.rng`.
         """
 
     @hookimpl
     def crossgrad_choose_scales(self, context: ScaleContext) -> ScaleResult:
-        """Implement the hook with the scales of this resolution."""
+        """Return this resolution's result for the hook."""
         answer = self.scales(context, context.state(STATE))
         scales, state = with_state(answer, Sequence, self, "scales")
         return ScaleResult(tuple(scales), states={STATE: state})

@@ -1,4 +1,4 @@
-"""The rule slot: plugins that act during training and are not part of the basic loop."""
+"""The rule slot: plugins that change the training in addition to the basic training loop."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,8 +16,7 @@ from crossgrad_core.contract.slots.backbone import Backbone
 class Rule(Component):
     """A plugin that changes the training through hooks (`@hookimpl`), if a run selects it.
 
-    The state and the random generator of the rule are named after the name under which the rule is
-    installed.
+    The rule's installed name is also the name of its state and of its random generator.
 
     Attributes:
         copies: Maximum number of copies of the parameters that the rule's state contains. Copies in
@@ -42,8 +41,8 @@ class GaussiansContext(StepContext):
 
     Attributes:
         view: The training view that is rendered.
-        gaussians: The Gaussians that the backbone decoded for the view, with their graph and with
-            the changes of earlier rules.
+        gaussians: The Gaussians that the backbone decoded for the view, with their autograd graph
+            and with the changes of earlier rules.
         rngs: Name of a rule -> its generator, the only source of its random numbers.
     """
 
@@ -54,7 +53,7 @@ class GaussiansContext(StepContext):
 
 @dataclass(frozen=True, eq=False)
 class GaussiansResult(Answer):
-    """Result of `crossgrad_view_gaussians`: the Gaussians to render, in the same number."""
+    """Result of `crossgrad_view_gaussians`: the Gaussians to render, as many as before."""
 
     gaussians: Gaussians
 

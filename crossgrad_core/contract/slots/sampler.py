@@ -19,7 +19,7 @@ class Sampler(Component):
         default_grouping: Name of the grouping that is used if the user names none; None if the
             sampler needs no groups.
         own_labels: Labels of the samples if the sampler makes its own groups and ignores the
-            grouping.
+            grouping; else empty.
         reads_groups: True if the samples depend on the groups of the training views.
         groups: Number of groups that the sampler needs; None for any number.
     """
@@ -59,7 +59,7 @@ class Sampler(Component):
 
     @hookimpl
     def crossgrad_sample_views(self, context: SampleContext) -> SampleResult:
-        """Implement the hook with the views chosen by this sampler."""
+        """Return this sampler's result for the hook."""
         answer = self.sample(context, context.state(STATE))
         draw, state = with_state(answer, ViewSample, self, "sample")
         return SampleResult(draw, states={STATE: state})

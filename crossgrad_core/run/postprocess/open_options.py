@@ -23,7 +23,7 @@ class How:
 
     Attributes:
         device: Device of the tensors; by default the device of the run.
-        threads: CPU threads; all by default.
+        threads: Number of CPU threads; all by default.
         accept_scene: Accept a scene whose photos, masks, points or held-out views have changed.
     """
 

@@ -1,4 +1,7 @@
-"""Output paths for later results of a run; files that summary.json describes are kept."""
+"""Output paths of results that are computed after a run.
+
+Files that summary.json describes are not overwritten.
+"""
 
 import logging
 from collections.abc import Iterator
@@ -18,14 +21,16 @@ _LOG = logging.getLogger(__name__)
 
 @contextmanager
 def writing_if_possible(folder: Path, doing: str) -> Iterator[bool]:
-    """Lock the run's folder and yield True; if the folder is read-only, warn and yield False."""
+    """Lock the run's folder and yield True; if this fails, log a warning and yield False."""
     with ExitStack() as stack:
         try:
             stack.enter_context(locked(folder, doing))
         except UserError as error:
             reason = f" ({error.found})" if error.found else ""
             _LOG.warning(
-                "%s%s: results are only shown, and none is written there", error.what, reason
+                "%s%s: results are shown in the terminal only and not written to the folder",
+                error.what,
+                reason,
             )
             yield False
         else:
@@ -36,7 +41,8 @@ def writing_if_possible(folder: Path, doing: str) -> Iterator[bool]:
 @contextmanager
 def writing(folder: Path, out: Path | None, doing: str) -> Iterator[None]:
     """Lock the run's folder, unless the results go to `out`."""
-    # Check before taking the lock, because a folder of another kind must not be changed.
+    # Check the folder before taking the lock, because the lock would change a folder that is not a
+    # run.
     require_checkpoint(folder)
     if out is not None:
         yield
@@ -55,14 +61,18 @@ def writing(folder: Path, out: Path | None, doing: str) -> Iterator[None]:
 
 
 def is_changed(setup: Setup) -> bool:
-    """Return True if the scene has changed; then the files that summary.json describes are kept."""
+    """Return True if the scene has changed since the training.
+
+    Files that summary.json describes must then not be overwritten.
+    """
     return any(note.startswith(ACCEPTED) for note in setup.scene.notes)
 
 
 def own_name(folder: Path, name: str, step: int) -> str:
-    """Return a file name for results of a step that does not replace a file of another step.
+    """Return a name for a file of results that does not replace a file of another step.
 
-    The run may have continued, and been killed, after summary.json and its files were written.
+    A run may have been continued and killed after it wrote summary.json. Then summary.json and its
+    files belong to an older step than the newest checkpoint.
     """
     described = summarised_step(folder)
     if described in {None, step}:

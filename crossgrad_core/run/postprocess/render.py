@@ -35,19 +35,20 @@ def render(
     how: Opens = AS_IT_IS,
     on: Path | None = None,
 ) -> None:
-    """Draw photo, render and error of views of a run, or of another capture of its place.
+    """Write panels with photo, render and error of the views of a run or of another capture.
 
     Args:
         folder: The run's folder.
         split: The views to render: test, train or all.
         out: Folder of the pictures; by default a folder inside the run's folder.
         how: The options for opening the run.
-        on: The other capture, whose views are rendered instead (see `evaluated_on`).
+        on: Folder of another capture of the same place, whose views are rendered instead of the
+            run's views.
 
     Raises:
-        UserError: The folder is not a run, the run has no checkpoint, the split is empty, `out`
-            already contains such a picture, or the run is training and `out` is not given; see also
-            `elsewhere`.
+        UserError: The folder is not a run, the run has no checkpoint, or the split is empty. Also
+            if `out` already contains a picture of the same name, or if the run is training and
+            `out` is not given. See also `elsewhere`.
     """
     with writing(folder, out, "rendering"):
         check_folder(out or folder)
@@ -85,7 +86,7 @@ def render_path(
     out: Path | None,
     how: Opens = AS_IT_IS,
 ) -> None:
-    """Render the images of cameras along a path, as images and as a video in the same folder.
+    """Render the cameras along a path, and write images and a video to the same folder.
 
     Args:
         folder: The run's folder.
@@ -95,9 +96,9 @@ def render_path(
         how: The options for opening the run.
 
     Raises:
-        UserError: See `camera_path`. Also if the folder is not a run, the run has no checkpoint,
-            the run is training and `out` is not given, `out` already contains a video or such
-            frames, or `frames` is given for a path from a file.
+        UserError: See `camera_path`. Also if the folder is not a run, the run has no checkpoint, or
+            the run is training and `out` is not given. Also if `out` already contains a video or
+            frames of the same names, or if `frames` is given for a path from a file.
     """
     if frames is not None and path != ZOOM:
         raise UserError(
@@ -126,7 +127,7 @@ def render_path(
                 drop_frames(out, len(files))
             made = write_video(files, along.fps)
             for video in video_files(out) if is_default_folder else ():
-                if video != made:  # The existing frames belong to another video.
+                if video != made:  # Delete a video of older frames.
                     video.unlink(missing_ok=True)
         video_line = (
             f"video {made}"

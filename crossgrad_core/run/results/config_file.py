@@ -1,4 +1,4 @@
-"""config.yaml: the resolved configuration, which repeats the run, and the version that wrote it."""
+"""config.yaml, which contains the configuration that repeats the run, and its version."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,11 +22,11 @@ NOTES: Final = "notes"
 
 
 def write_config(folder: Path, config: RunConfig, notes: Sequence[str] = ()) -> None:
-    """Write the configuration that repeats the run, and its first notes.
+    """Write the configuration that repeats the run, and the notes of the run's start.
 
-    A run whose length changes with its time budget rewrites the file.
+    A run with a time budget writes the file again when its length changes.
     """
-    # This setting applies to one start only.
+    # Leave out `stop_after`, because the setting applies to one start of the run only.
     config = config.model_copy(update={"stop_after": None})
     noted = write_yaml({NOTES: list(notes)}) if notes else ""
     write_atomically(folder / FILE, text_bytes(f"{as_yaml(config)}{noted}"))
@@ -66,7 +66,7 @@ def read_notes(folder: Path) -> tuple[str, ...]:
 
 
 def as_yaml(config: RunConfig) -> str:
-    """Return the configuration as a user would write it, with the version that writes it."""
+    """Return the configuration as YAML text, with the version of crossgrad."""
     return write_yaml(marked(config.model_dump(mode="json")))
 
 
@@ -75,7 +75,7 @@ def _content(folder: Path) -> dict[str, Any]:
 
 
 def marked(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings with the version that writes them."""
+    """Return the settings with the version of crossgrad added."""
     return {KEY: CURRENT, **settings}
 
 

@@ -19,11 +19,12 @@ if TYPE_CHECKING:
 FILE = "curve.png"
 _OVERALL = "overall"
 
-#: Okabe and Ito's colours, distinguishable with any colour vision. Black is kept for `overall`.
+#: Okabe and Ito's colours, which people with any type of colour vision can distinguish. Black is
+#: used for `overall` only.
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _MARKERS = ("s", "^", "D", "v", "P", "X")
 _STYLES = ("--", "-.", ":")
-#: With more points than this, markers would hide the line.
+#: Maximum number of points with markers. With more points, markers would hide the line.
 _MOST_MARKERS = 25
 _LONGEST_IN_TWO_COLUMNS = 48  # in characters of a legend entry
 
@@ -41,14 +42,14 @@ class _Line(NamedTuple):
 def draw_curve(
     folder: Path, rows: Sequence[Row], title: str, views: Mapping[str, int] | None = None
 ) -> Path:
-    """Draw curve.png; without held-out views it shows the training loss instead.
+    """Draw curve.png; without held-out views, the curve shows the training loss.
 
     Args:
         folder: The run's folder.
         rows: Rows of metrics.csv.
         title: Title of the chart.
-        views: Number of held-out views of each regime, and of all views under "overall"; None draws
-            no lines by regime.
+        views: Number of held-out views of each regime, and of all views under "overall". If None,
+            the chart contains no lines for regimes.
 
     Returns:
         The file.
@@ -82,14 +83,14 @@ def _lines(rows: Sequence[Row], views: Mapping[str, int]) -> list[_Line]:
     lines = [_Line(_labelled(_OVERALL, "", rows[-1], views), "")]
     regimes = [name for name in sorted(views) if name != _OVERALL and f"psnr_{name}" in rows[0]]
     looks = zip(cycle(_COLORS), cycle(_MARKERS), cycle(_STYLES), strict=False)
-    if len(regimes) > 1:  # The curve of a single regime would be equal to the curve `overall`.
+    if len(regimes) > 1:  # The curve of a single regime is equal to the curve `overall`.
         for name, look in zip(regimes, looks, strict=False):
             lines.append(_Line(_labelled(name, f"_{name}", rows[-1], views), f"_{name}", *look))
     return lines
 
 
 def _labelled(name: str, column: str, last: Row, views: Mapping[str, int]) -> str:
-    """Return a name with its number of views and its final PSNR and SSIM."""
+    """Return the label of a regime: its name, number of views, final PSNR and final SSIM."""
     count = views.get(name)
     label = _literal(name)
     if count is not None:
@@ -99,7 +100,7 @@ def _labelled(name: str, column: str, last: Row, views: Mapping[str, int]) -> st
 
 
 def _literal(text: str) -> str:
-    """Return text that matplotlib shows literally, without hidden _ or formulas between $."""
+    """Return text that matplotlib shows literally: no label is hidden and no formula is drawn."""
     text = one_line(text).replace("$", r"\$")
     return f"'{text}'" if text.startswith("_") else text
 
@@ -125,7 +126,7 @@ def _draw(ax: "Axes", rows: Sequence[Row], metric: str, lines: Sequence[_Line]) 
 
 
 def _add_view_axis(ax: "Axes", rows: Sequence[Row]) -> None:
-    """Add a second scale above the chart with rendered views at round numbers."""
+    """Add a second axis above the chart with round numbers of rendered views."""
     from matplotlib.ticker import MaxNLocator
 
     counted = [(row["train_seconds"], row["views"]) for row in rows]

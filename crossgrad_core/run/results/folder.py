@@ -1,4 +1,7 @@
-"""The output folder of a run, checked before any work: new, writable and on a disk with space."""
+"""The output folder of a run.
+
+Before training, the folder must be new and writable, and the disk must have enough space.
+"""
 
 import re
 import tempfile
@@ -19,7 +22,7 @@ from crossgrad_core.system.files import (
     is_leftover,
 )
 
-#: Number of bytes that a run with a small scene and few renders may write.
+#: Number of bytes that a run of a small scene with few renders writes at most.
 SMALLEST_NEED = 64 * 2**20
 #: Folder that contains all runs, relative to the working folder.
 RUNS = Path("runs")
@@ -60,9 +63,9 @@ def create_run_folder(
     Args:
         name: The parts of the name of the folder below `root`; if two runs start in the same
             second, the later run gets the suffix -2.
-        out: The folder itself if the user named one; it must be new or empty.
+        out: The output folder if the user named a folder; it must be new or empty.
         root: Folder of all runs.
-        needed: Bytes that the run may write.
+        needed: Number of bytes that the run writes at most.
 
     Raises:
         UserError: `out` is not empty, the folder is not writable, or the disk is too full.
@@ -80,9 +83,9 @@ def create_run_folder(
 
 
 def check_out(out: Path | None) -> None:
-    """Refuse a folder that is not empty; create nothing, so that this can be checked early.
+    """Refuse a folder that is not empty, before anything is created.
 
-    Files of a run that was killed before it wrote results do not count.
+    A lock file and half-written files of a killed run are allowed.
 
     Raises:
         UserError: `out` is a file or is not empty.
@@ -119,8 +122,8 @@ def clear_half_written(folder: Path) -> None:
 
 
 def expected_bytes(primitives: int, checkpoints: int) -> int:
-    """Estimate the bytes that a run writes: SH degree 3, two Adam moments, one PLY file."""
-    # Count one more checkpoint, because the old ones exist while a new one is written.
+    """Estimate the number of bytes that a run writes in checkpoints and in one PLY file."""
+    # Add one checkpoint, because all old checkpoints exist while a new checkpoint is written.
     floats = 59 * 3 * (checkpoints + 1) + 62
     return max(SMALLEST_NEED, 4 * floats * primitives)
 

@@ -1,4 +1,4 @@
-"""Files of a run that its checkpoints also store, so that damage is detected or repaired."""
+"""Copies of a run's files in its checkpoints, which help to detect or repair damage."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,7 +22,7 @@ _REVISED: Final = frozenset({"steps", "revisions"})
 
 
 def kept_files(folder: Path) -> dict[str, Json]:
-    """Return the texts of the files that a checkpoint stores, if they exist."""
+    """Return file name -> content for the existing files that a checkpoint stores."""
     contents = {name: _content(folder / name) for name in (CONFIG, METRICS)}
     return {
         name: text.decode(errors="replace") for name, text in contents.items() if text is not None
@@ -30,7 +30,7 @@ def kept_files(folder: Path) -> dict[str, Json]:
 
 
 def restored(folder: Path, scalars: Mapping[str, Any], step: int) -> tuple[str, ...]:
-    """Restore metrics.csv as it was at a checkpoint; rows that were added later are removed.
+    """Restore metrics.csv as it was at a checkpoint; later rows are removed.
 
     Args:
         folder: The run's folder.
@@ -43,7 +43,7 @@ def restored(folder: Path, scalars: Mapping[str, Any], step: int) -> tuple[str, 
     text = (scalars.get(KEY) or {}).get(METRICS)
     present = _content(folder / METRICS)
     if text is None or present == text.encode():
-        return ()  # The file did not exist when the checkpoint was written, or it is complete.
+        return ()  # The checkpoint contains no copy of the file, or the file is equal to the copy.
     write_atomically(folder / METRICS, text.encode())
     if present is not None and present.startswith(text.encode()):
         return ()
@@ -52,7 +52,7 @@ def restored(folder: Path, scalars: Mapping[str, Any], step: int) -> tuple[str, 
 
 
 def edited(folder: Path, scalars: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return a note if config.yaml differs from its content when the checkpoint was written."""
+    """Return a note if config.yaml has changed since the checkpoint was written."""
     text = (scalars.get(KEY) or {}).get(CONFIG)
     if text is None:
         return ()

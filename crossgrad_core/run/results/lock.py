@@ -1,4 +1,4 @@
-"""One writer per run folder: a lock that ends with its process."""
+"""The lock of a run's folder, so that only one process writes to the folder."""
 
 import errno
 import json
@@ -18,13 +18,12 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.system.check_writable import check_own
 from crossgrad_core.system.files import disk_errors
 
-#: Name of the locked file. The file remains when its process has ended, but then no process holds
-#: the lock.
+#: Name of the lock file. After a process ends, the file still exists, but no process holds the
+#: lock.
 FILE = "run.lock"
 
 _TAKEN = frozenset({errno.EAGAIN, errno.EACCES, errno.EWOULDBLOCK, errno.EDEADLK})
-# Windows locks ranges of bytes, which other processes then cannot read. Lock a byte far after the
-# content.
+# On Windows, other processes cannot read locked bytes. Therefore lock a byte far after the content.
 _FAR = 2**30
 _MOST = 4096  # maximum number of bytes of the lock holder's description
 
@@ -36,7 +35,7 @@ class Holder:
     Attributes:
         pid: Number of the process.
         host: Name of the machine.
-        since: Local time, to the second.
+        since: Local time at which the process took the lock, to the second.
         doing: What the process does in the folder.
     """
 
@@ -63,17 +62,17 @@ class RunInUseError(UserError):
 
 @contextmanager
 def locked(folder: Path, doing: str) -> Iterator[bool]:
-    """Keep other processes from writing into a run's folder inside the block.
+    """Prevent other processes from writing into a run's folder inside the block.
 
-    The lock belongs to an open file, so that it ends with its process, even if the process is
+    The lock belongs to an open file of the process. Therefore the lock also ends if the process is
     killed.
 
     Args:
         folder: The run's folder.
-        doing: The work of this process in the folder, for messages to refused processes.
+        doing: The work of this process in the folder, for messages of other processes.
 
-    Yields: True if the folder is locked, False if its file system has no locks (some network file
-    systems).
+    Yields: True if the folder is locked, False if the file system does not support locks, as on
+    some networks.
 
     Raises:
         RunInUseError: Another process holds the lock; the message names the process and its start
@@ -83,7 +82,8 @@ def locked(folder: Path, doing: str) -> Iterator[bool]:
     path = folder / FILE
     check_own(path)
     with disk_errors(path):
-        # Do not buffer: on close, a buffer would write again the data that a full disk had refused.
+        # Do not use a buffer. When a file is closed, its buffer tries again to write data that did
+        # not fit on the disk, and fails again.
         file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o666), "r+b", buffering=0)
     with file:
         taken = _take(file)
@@ -121,7 +121,7 @@ def _named(holder: Holder | None) -> str:
 
 
 def _take(file: BinaryIO) -> Literal["by us", "by another", "not at all"]:
-    """Try to take the lock and return its owner; `not at all` on file systems without locks."""
+    """Try to take the lock and return who holds it; `not at all` on file systems without locks."""
     try:
         _lock(file)
     except OSError as error:

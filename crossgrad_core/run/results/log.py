@@ -1,4 +1,4 @@
-"""log.txt: the text that the terminal showed, with the time of day."""
+"""log.txt, which contains the messages of a run with the time of day."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -11,9 +11,9 @@ from crossgrad_core.recipe.table import full_lines
 from crossgrad_core.system.check_writable import check_own
 from crossgrad_core.wording import showable
 
-#: Weight of a new value in the smoothed loss and step rate.
+#: Weight of a new value in the smoothed loss and in the smoothed time per step.
 SMOOTHING = 0.05
-#: A change of the length is reported only if it is larger than this share.
+#: Smallest change of the number of steps that is reported, as a share of the planned number.
 NEWS_SHARE = 0.1
 
 
@@ -22,11 +22,11 @@ class Pace:
     """Smoothed statistics of the steps so far.
 
     Attributes:
-        total: Steps of the whole run.
+        total: Number of steps of the whole run.
         first: The step after which this session began (above 0 for a resumed run).
         record: The last step; None before the first step.
         loss: Exponentially smoothed mean loss of the step's views.
-        seconds: Exponentially smoothed training seconds of a step; None after the first step only.
+        seconds: Exponentially smoothed training seconds of a step; None before the second step.
         psnr: Overall PSNR of the last evaluation; None before the first evaluation.
         planned: Number of steps of the first plan if the length has changed; None otherwise.
     """
@@ -75,7 +75,7 @@ class Pace:
 
 
 def progress_line(pace: Pace) -> str:
-    """Return step, share, loss, PSNR, primitives, speed and time left; empty before step 1."""
+    """Return a line about the progress of a run; empty before the first step."""
     record = pace.record
     if record is None:
         return ""
@@ -88,7 +88,7 @@ def progress_line(pace: Pace) -> str:
 
 
 def length_lines(pace: Pace) -> list[str]:
-    """Return a line about a changed length, if the change is large enough."""
+    """Return a line about a changed number of steps if the change is at least `NEWS_SHARE`."""
     planned = pace.planned
     if planned is None or abs(pace.total - planned) < NEWS_SHARE * planned:
         return []
@@ -101,7 +101,7 @@ def length_lines(pace: Pace) -> list[str]:
 
 
 def figures(pace: Pace) -> list[str]:
-    """Return loss, PSNR and primitives; also used at the end of a progress bar."""
+    """Return the texts of loss, PSNR and number of primitives, for log and progress bar."""
     parts = [f"loss {pace.loss:.4f}"]
     if pace.psnr is not None:
         parts.append(f"PSNR {pace.psnr:.2f}")
@@ -131,7 +131,7 @@ def duration(seconds: float) -> str:
 
 
 def roughly(seconds: float) -> str:
-    """Format an estimate in whole minutes, from two hours on with hours."""
+    """Format an estimated time in whole minutes, or in hours and minutes from two hours on."""
     minutes = max(1, round(seconds / 60.0))
     if minutes < 120:  # noqa: PLR2004 - two hours
         return f"about {minutes} min"
@@ -164,11 +164,11 @@ def _now() -> datetime:
 
 
 class RunLog:
-    """The writer of log.txt; the loop registers this plugin in addition to the selected plugins.
+    """The writer of log.txt, which every run registers in addition to the selected plugins.
 
     Args:
         folder: The run's folder; an existing log is continued.
-        clock: The local time.
+        clock: Function that returns the local time.
 
     Raises:
         UserError: The log is a link or a pipe.
@@ -185,15 +185,15 @@ class RunLog:
     def write(self, text: str) -> None:
         """Append a text of one or more lines, each with the time of day.
 
-        A failure to write (a full disk) does not end the run. The lines are lost, and the next line
-        that can be written reports the gap.
+        If the disk is full, the run continues without these lines. The next successful entry
+        reports that lines are missing.
         """
         stamp = self._clock().strftime("%H:%M:%S")
         gap = [f"(lines are missing here: {self._missing})"] if self._missing else []
         lines = [f"{stamp}  {line}".rstrip() for line in (*gap, *showable(text).splitlines())]
         try:
-            # The file is opened for every entry, so that it is complete even if the run is
-            # interrupted.
+            # Open the file for every entry, so that all entries are in the file if the run is
+            # killed.
             with self._path.open("a", encoding="utf-8", errors="backslashreplace") as file:
                 file.write("\n".join([*lines, ""]))
             self._missing = ""

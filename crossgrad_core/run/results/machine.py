@@ -19,22 +19,23 @@ from crossgrad_core.system.version import VERSION
 LOOK_SECONDS = 1.0
 #: Duration of a calibration in seconds.
 CALIBRATION_SECONDS = 2.0
-#: Runs that trained for fewer seconds are not calibrated, because calibration would take too long
-#: for them.
+#: Shortest training time of a run with a calibration, in seconds. In shorter runs, the calibration
+#: would take too large a part of the time.
 WORTH_A_CALIBRATION = 20.0
-#: Number of values in the fixed workload, and number of passes over the values between two readings
-#: of the clock.
+#: Number of values in the calibration workload, and number of passes over the values between two
+#: readings of the clock.
 _NUMBERS, _PASSES = 1 << 16, 8
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """The measured speed of a fixed workload on one thread.
+    """The speed of one CPU thread, measured with a fixed workload.
 
     Attributes:
         seconds: Duration of the calibration.
-        rate: Passes per second of wall-clock time.
-        cpu_rate: Passes per second of CPU time: the machine's speed, independent of its load.
+        rate: Passes over the workload per second of wall-clock time.
+        cpu_rate: Passes over the workload per second of CPU time. Other processes have little
+            effect on this number.
     """
 
     seconds: float
@@ -43,7 +44,7 @@ class Calibration:
 
 
 def calibrated(seconds: float = CALIBRATION_SECONDS) -> Calibration:
-    """Run the workload: products, exponentials and roots of 65,536 numbers in float32."""
+    """Measure the speed with products, exponentials and square roots of 65,536 float32 numbers."""
     numbers = np.linspace(0.0, 1.0, _NUMBERS, dtype=np.float32)
     room = np.empty_like(numbers)
     passes, start, cpu = 0, perf_counter(), thread_time()
@@ -58,7 +59,7 @@ def calibrated(seconds: float = CALIBRATION_SECONDS) -> Calibration:
 
 
 class Machine:
-    """A recorder of the machine's load during the steps of a session; a plugin of the run."""
+    """A plugin that records the machine's load during the steps of a session."""
 
     def __init__(self) -> None:
         self._looked = 0.0
@@ -67,14 +68,14 @@ class Machine:
 
     @hookimpl
     def crossgrad_step_end(self, record: StepRecord) -> None:
-        """Record the load, at most once per second."""
+        """Record the load of the machine, at most once per second."""
         now = perf_counter()
         if now - self._looked >= LOOK_SECONDS and hasattr(os, "getloadavg"):
             self._looked = now
             self._loads.append(os.getloadavg()[0])
 
     def figures(self, train_seconds: float) -> dict[str, Json]:
-        """Return the machine's entries for summary.json: `load` and `calibration`, null if unknown.
+        """Return the entries `load` and `calibration` for summary.json; null if unknown.
 
         Args:
             train_seconds: Training seconds of the run; a short run is not calibrated.
@@ -100,7 +101,7 @@ _PACKAGES = ("torch", "numba", "numpy", "scipy", "scikit-image", "pycolmap", "pl
 def environment(device: str = "cpu") -> dict[str, Json]:
     """Return the machine, the device, the threads and the versions as plain data.
 
-    This imports no package except torch.
+    This function imports no package except torch.
 
     Args:
         device: Torch device that the run used.
@@ -123,9 +124,9 @@ def environment(device: str = "cpu") -> dict[str, Json]:
 
 
 def commit(package: Path = Path(__file__).parents[2]) -> str | None:
-    """Return the commit of the checkout that contains the code, with a `+` if files differ from it.
+    """Return the git commit of the code, with a `+` if files differ from this commit.
 
-    Return None for an installed package, and if git is not available.
+    Return None for an installed package, or if git is not available.
 
     Args:
         package: Folder of the package `crossgrad_core`.
@@ -142,7 +143,7 @@ def commit(package: Path = Path(__file__).parents[2]) -> str | None:
 
 
 def _git(root: Path, *arguments: str) -> str:
-    # Take no locks, so that other processes can commit while a run reads.
+    # Take no git locks, so that another process can commit at the same time.
     command = ["git", "--no-optional-locks", "-C", str(root), *arguments]
     done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=20)
     return done.stdout.strip()

@@ -1,4 +1,4 @@
-"""metrics.csv: one row per evaluation, which is written to the disk immediately."""
+"""metrics.csv, which contains one row per evaluation; each row is written to disk immediately."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -18,15 +18,15 @@ class Totals:
     """The cost of a run up to an evaluation.
 
     Attributes:
-        step: Optimizer steps.
-        views: Rendered training views.
-        backward_passes: Backward passes.
-        train_seconds: Training seconds; compiling, loading, evaluating and reporting excluded.
+        step: Number of optimizer steps.
+        views: Number of rendered training views.
+        backward_passes: Number of backward passes.
+        train_seconds: Training seconds without compiling, loading, evaluating and reporting.
         primitives: Number of primitives.
         peak_memory_mib: Peak memory, MiB; None if the system does not report it.
-        loss: Mean photometric loss of the last step, None before the first.
-        cpu_seconds: CPU seconds of the process in the training seconds, all threads together.
-        peak_primitives: Largest number of primitives after a step; None if unknown.
+        loss: Mean photometric loss of the last step; None before the first step.
+        cpu_seconds: CPU seconds of all threads of the process during training.
+        peak_primitives: Largest number of primitives after any step; None if unknown.
     """
 
     step: int
@@ -49,7 +49,7 @@ _TODO = "restore the file, or repeat the run: crossgrad run --config config.yaml
 
 
 def columns_for(regimes: Sequence[str], figures: Sequence[Figure]) -> tuple[str, ...]:
-    """Return the columns for a run whose test views belong to these regimes."""
+    """Return the columns of metrics.csv for these regimes of held-out views and these metrics."""
     split = [figure for figure in figures if figure.per_regime]
     of_regimes = [figure.column(regime) for regime in sorted(regimes) for figure in split]
     return (*_FIRST, *(figure.name for figure in figures), *of_regimes, *_LAST)
@@ -88,10 +88,10 @@ class MetricsCsv:
 
     @classmethod
     def resume(cls, folder: Path, columns: tuple[str, ...], step: int) -> "MetricsCsv":
-        """Open the table of a run that continues after `step`; later rows are dropped.
+        """Open the table of a run that continues after `step`; rows of later steps are dropped.
 
         Raises:
-            UserError: The table cannot be read, or has other columns, so it belongs to another run.
+            UserError: The table cannot be read, or its columns belong to another run.
         """
         path = folder / FILE
         if not path.is_file():
@@ -106,7 +106,7 @@ class MetricsCsv:
                 found=",".join(lines[0]) if lines else "an empty file",
                 todo="resume with the scene and the split that the run was started with",
             )
-        # A row that a crash cut short has fewer cells. The resumed run writes this row again.
+        # Drop a row with missing cells, which a crash left. The resumed run writes this row again.
         whole = [line for line in lines[1:] if len(line) == len(table.columns)]
         steps = [row["step"] for row in _rows(path, lines[0], whole)]
         lines_and_steps = zip(whole, steps, strict=True)
@@ -117,7 +117,7 @@ class MetricsCsv:
         """Write a row and wait until it is on the disk; a failed write leaves no partial row.
 
         Raises:
-            ValueError: The row has a column that the table lacks.
+            ValueError: The row contains a column that is not in the table.
             UserError: The disk is full.
         """
         unknown = set(row) - set(self.columns)
@@ -167,7 +167,7 @@ def _rows(path: Path, header: Sequence[str], lines: Sequence[Sequence[str]]) -> 
 
 
 def _is_step(number: float | None) -> bool:
-    """Return True if the value can be a step; the cell may be empty."""
+    """Return True if the value can be a step, or if it is None for an empty cell."""
     return number is None or (isinstance(number, int) and number >= 0)
 
 
@@ -180,7 +180,7 @@ def _append(path: Path, content: bytes) -> None:
         size = file.tell()
         try:
             left = memoryview(content)
-            while left:  # The system may write only a part of the data.
+            while left:  # One call may write only a part of the data.
                 left = left[file.write(left) :]
             os.fsync(file.fileno())
         except OSError:
@@ -189,7 +189,7 @@ def _append(path: Path, content: bytes) -> None:
 
 
 def _lines(path: Path) -> list[list[str]]:
-    """Return all complete lines; a truncated last line has no line end and is left out."""
+    """Return all complete lines; a last line without a line end is incomplete and left out."""
     return read_rows(path, FILE, _TODO, whole=True)
 
 
@@ -203,7 +203,7 @@ _RESTORE_VIEWS = "restore the file, or write it again: crossgrad eval RUN"
 
 
 def write_per_view(folder: Path, result: EvaluationResult, name: str = PER_VIEW) -> None:
-    """Write one line per view: name, regime, metrics; an empty cell if a metric is unknown.
+    """Write one line per view with name, regime and metrics; an unknown metric gives an empty cell.
 
     Raises:
         UserError: The disk is full.
@@ -219,7 +219,7 @@ def write_per_view(folder: Path, result: EvaluationResult, name: str = PER_VIEW)
 def read_per_view(folder: Path) -> tuple[ViewMetrics, ...]:
     """Return the metrics of every held-out view of a run, in the order of the scene.
 
-    Returns: The views; empty if the file does not exist, as before the first evaluation.
+    Returns: The metrics of each view; empty if the file does not exist yet.
 
     Raises:
         UserError: The file is damaged.

@@ -28,7 +28,9 @@ _LONGEST = 120  # bytes
 
 
 def flat_names(names: Sequence[str]) -> dict[str, str]:
-    """Return view name -> file name without folders and suffix, unique even if case is ignored.
+    """Return view name -> unique file name without folders and suffix.
+
+    Two file names always differ in more than upper and lower case.
 
     `aerial/0001.jpg` becomes `aerial__0001`; a name that is already used gets -2, -3 and so on.
     """
@@ -48,12 +50,12 @@ def flat_names(names: Sequence[str]) -> dict[str, str]:
 
 
 def ending(name: str) -> str:
-    """Return the end of a name that is too long to be a part of a file name."""
+    """Return at most the last `_LONGEST` bytes of a name, so that a file name can contain it."""
     return name.encode()[-_LONGEST:].decode(errors="ignore")
 
 
 def chosen_views(views: "Sequence[View]", count: int) -> "tuple[View, ...]":
-    """Choose `count` views (or all): from every regime in turn, evenly spread within the regime."""
+    """Return at most `count` views, taken evenly from all regimes and evenly within a regime."""
     regimes = sorted({view.regime for view in views})
     groups = [[view for view in views if view.regime == regime] for regime in regimes]
     share = [0] * len(groups)
@@ -75,7 +77,8 @@ def _spread(group: "Sequence[View]", wanted: int) -> "list[View]":
 
 
 FOLDER = "renders"
-#: Smaller images are enlarged by a whole factor, so that the labels fit.
+#: Minimum width of an image in a panel, in pixels. Smaller images are enlarged by an integer
+#: factor, so that the labels fit.
 _NARROWEST = 360
 _SMALLEST_FONT, _LARGEST_FONT, _FONTS_PER_WIDTH = 12, 26, 38
 _COLUMNS = ("photo", "render", "error")
@@ -106,7 +109,7 @@ class Layout:
 
     @property
     def top(self) -> int:
-        """Upper edge of the images."""
+        """Vertical position of the upper edge of the images."""
         return self.margin + round(3.2 * self.font)
 
     @property
@@ -152,7 +155,7 @@ def folder_of(run: Path, step: int) -> Path:
 
 
 def panels_of(run: Path, step: int, names: Sequence[str]) -> dict[str, Path]:
-    """Return view name -> picture of its photo, render and error, for views that have a picture.
+    """Return view name -> panel with photo, render and error, for views with a panel.
 
     Args:
         run: The run's folder.
@@ -168,7 +171,7 @@ def read_panel(path: Path) -> "dict[str, Image]":
     """Return the images in a panel by name: `photo`, `render` and `error`.
 
     Raises:
-        UserError: The file is not such a panel.
+        UserError: The file is not a panel.
     """
     from PIL import Image
 
@@ -197,8 +200,8 @@ def _unreadable(path: Path, found: str) -> UserError:
     )
 
 
-#: Errors of at least this size get the last colour. The limit is fixed, so that panels are
-#: comparable.
+#: Smallest error that gets the last colour of the colour map. This limit is fixed, so that panels
+#: of different runs are comparable.
 LARGEST_ERROR = 0.25
 _COLORMAP = "inferno"
 _TICKS = (0.0, 0.05, 0.10, 0.15, 0.20, 0.25)
@@ -209,11 +212,11 @@ Pixels = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class PanelWriter:
-    """A writer of panels for some views during an evaluation; pass `write` as `on_view`.
+    """A writer of panels for some views; an evaluation calls `write` for each view.
 
     Attributes:
         folder: renders/<step> of the run.
-        files: View name -> file name without suffix, of the views that get a panel.
+        files: View name -> file name without suffix, for the views that get a panel.
         step: The step, for the title.
     """
 
@@ -223,7 +226,7 @@ class PanelWriter:
 
     @classmethod
     def of(cls, run: Path, step: int, views: Sequence[View], count: int) -> "PanelWriter":
-        """Return a writer for at most `count` of these views, spread over the regimes."""
+        """Return a writer for at most `count` of these views, taken evenly from all regimes."""
         names = flat_names([view.name for view in views])
         chosen = {view.name: names[view.name] for view in chosen_views(views, count)}
         return cls(folder_of(run, step), chosen, step)
@@ -302,7 +305,7 @@ def _hatched(image: Pixels, mask: Pixels | None, period: int) -> Pixels:
 
 
 def _font(size: int, *, bold: bool = False) -> "FreeTypeFont":
-    """Load Matplotlib's DejaVu Sans, because it exists on every machine and covers most scripts."""
+    """Return the font DejaVu Sans, which Matplotlib contains and which covers most scripts."""
     from matplotlib import get_data_path
     from PIL import ImageFont
 

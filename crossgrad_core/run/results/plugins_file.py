@@ -26,7 +26,7 @@ class Package(BaseModel):
     """A package that trains a run.
 
     Attributes:
-        versions: The versions that trained the run, in order.
+        versions: The versions of the package that trained the run, in order of time.
         components: Components of the package in the run, such as `operator pcgrad`; empty for
             crossgrad.
     """
@@ -66,7 +66,7 @@ def write_plugins(folder: Path, packages: Packages) -> None:
 
 
 def read_plugins(folder: Path, *, quiet: bool = False) -> Packages | None:
-    """Return the packages that trained a run; if unknown, None, with a note unless `quiet`."""
+    """Return the packages that trained a run; if unknown, return None and log a warning."""
     path = folder / FILE
     try:
         return _PACKAGES.validate_json(read_file(path))
@@ -80,7 +80,7 @@ def read_plugins(folder: Path, *, quiet: bool = False) -> Packages | None:
 
 
 def with_present(known: Packages | None, present: Packages) -> Packages:
-    """Merge the known packages with the present packages; a new version is added at the end."""
+    """Return the known packages, extended by the versions of the present packages."""
     known = known or {}
     packages = {**known}
     for name, package in present.items():
@@ -91,7 +91,7 @@ def with_present(known: Packages | None, present: Packages) -> Packages:
 
 
 def history(packages: Packages) -> tuple[str, ...]:
-    """Return a note on each package if several versions of it trained the run."""
+    """Return a note on each package of which several versions trained the run."""
     return tuple(
         (
             f"trained with {name} {', then '.join(package.versions)} "
@@ -121,7 +121,7 @@ def refuse_missing(
 
     Args:
         folder: The run's folder.
-        packages: The packages that trained it; None if they are unknown.
+        packages: The packages that trained the run; None if they are unknown.
         optional: Slots (singular words) whose components are not needed.
 
     Raises:
@@ -178,7 +178,7 @@ def refuse_changed(folder: Path, packages: Packages | None) -> None:
 
 
 def report_changed(packages: Packages | None) -> None:
-    """Warn that other versions of packages trained the run."""
+    """Log a warning for each package of which another version trained the run."""
     for was, now in changes(packages).items():
         _LOG.warning("the run was trained with %s; the installed version is %s", was, now)
 
@@ -203,7 +203,7 @@ def _described(entry: Entry) -> str:
 
 
 def _entry(component: str) -> Entry | None:
-    """Return the entry of a component such as `operator pcgrad`; None if it is not installed."""
+    """Return the entry of a component such as `operator pcgrad`; None for a missing component."""
     word, _, name = component.partition(" ")
     return entries(plural(word)).get(name) if plural(word) in GROUPS else None
 
@@ -213,10 +213,10 @@ def _lacks(component: str, optional: Container[str]) -> bool:
 
 
 def _found(package: str) -> str:
-    """Describe the installed state of a package whose components are missing."""
+    """Return the installed version of a package whose components are missing, as a message."""
     from importlib.metadata import PackageNotFoundError, version
 
     try:
-        return f"{package} {version(package)}, which does not contain them"
+        return f"{package} {version(package)}, which does not contain these components"
     except (PackageNotFoundError, ValueError):
         return f"package {package} is not installed"

@@ -1,6 +1,6 @@
-"""Reading of a run's results for comparisons: configuration, metrics.csv, summary.json, views.
+"""Functions that read the results of a run, for comparisons of runs.
 
-The module does not import torch, so that a table of many runs appears without delay.
+The module does not import torch, because the import would delay a table of many runs.
 """
 
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ from crossgrad_core.run.results.summary import read_summary
 from crossgrad_core.system.checksums import check_unchanged
 from crossgrad_core.system.text_files import read_json
 
-#: File with the fingerprint of a run's scene. The module results/scene_file.py writes it.
+#: File with the fingerprint of a run's scene. The module results/scene_file.py writes this file.
 SCENE = "scene.json"
 #: The files of a run that this module reads.
 _READ: Final = (CONFIG, METRICS, PER_VIEW, SUMMARY, SCENE)
@@ -46,12 +46,12 @@ class RunResults:
 
     @cached_property
     def regimes(self) -> tuple[str, ...]:
-        """The regimes of the held-out views by name; empty before the run has ended."""
+        """Names of the regimes of the held-out views; empty before the run has ended."""
         return tuple((self.summary or {}).get("regimes") or ())
 
     @cached_property
     def scene_marks(self) -> Mapping[str, Any] | None:
-        """The fingerprint of the scene: views with split, camera and photo; None for older runs.
+        """The content of scene.json, which describes all views of the scene; None for older runs.
 
         Raises:
             UserError: The file is damaged.
@@ -81,19 +81,21 @@ class RunResults:
     def curve(
         self, name: str, regime: str | None = None, over: str = "train_seconds"
     ) -> list[tuple[float, float]]:
-        """Return (`over`, metric) of every evaluation that has both values."""
+        """Return the pairs (`over`, metric) of all evaluations that contain both values."""
         column = name if regime is None else f"{name}_{regime}"
         points = [(row.get(over), row.get(column)) for row in self.rows]
         return [(float(x), float(y)) for x, y in points if x is not None and y is not None]
 
 
 def read_run(folder: Path) -> RunResults:
-    """Return the results of a run, which may still be training. Imports no torch.
+    """Return the results of a run, which may still be training, without importing torch.
 
     Raises:
         UserError: The folder is not a run, or one of its files is damaged.
     """
-    check_unchanged(folder, _READ, f"restore it, or repair it with crossgrad run --resume {folder}")
+    check_unchanged(
+        folder, _READ, f"restore the file, or repair it with crossgrad run --resume {folder}"
+    )
     summary = read_summary(folder) if (folder / SUMMARY).is_file() else None
     views = () if summary is None else read_per_view(folder)
     return RunResults(folder, read_config(folder), read_metrics(folder), summary, views)

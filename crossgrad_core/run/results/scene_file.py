@@ -14,8 +14,8 @@ from crossgrad_core.system.checksums import changed_files
 from crossgrad_core.system.files import write_atomically
 from crossgrad_core.system.input_files import read_file
 
-#: Advice for the most serious difference. The key None stands for a difference that can be
-#: accepted.
+#: Most serious difference of the scene -> advice for the user. The key None stands for differences
+#: that the user can accept.
 _WAYS_OUT = {
     None: "restore the scene, or add --accept-scene to continue with the changed scene",
     Weight.HELD_OUT: (
@@ -47,7 +47,7 @@ def write_scene(folder: Path, fingerprint: Fingerprint) -> None:
 
 
 def read_scene_file(folder: Path) -> Fingerprint | None:
-    """Return the fingerprint of the scene that trained a run; if unknown, None, with a note."""
+    """Return the fingerprint of a run's scene; if it is unknown, log a warning and return None."""
     path = folder / FILE
     why = f"{path} is damaged, or another version wrote it"
     try:
@@ -70,14 +70,15 @@ def check_scene(
     Args:
         folder: The run's folder.
         now: The present scene.
-        tolerated: The most serious difference that the command can accept.
-        accept: True if the user accepts such differences (`--accept-scene`).
+        tolerated: The most serious kind of difference that the calling command can accept.
+        accept: True if the user accepts tolerated differences (`--accept-scene`).
 
     Returns:
         A note on the differences, if there are any.
 
     Raises:
-        UserError: The scene differs by more than is tolerated, or the user did not accept it.
+        UserError: The scene has a difference that is not tolerated, or the user did not accept the
+            differences.
     """
     was = read_scene_file(folder)
     changed = [] if was is None else differences(was, now)

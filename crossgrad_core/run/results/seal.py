@@ -1,4 +1,4 @@
-"""SHA256SUMS of a run's folder, written when the run ends."""
+"""The file SHA256SUMS of a run's folder, which is written when the run ends."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,7 +11,8 @@ from crossgrad_core.run.results.sources import FILE as SOURCES
 from crossgrad_core.system.checksums import SUMS, write_checksums
 from crossgrad_core.system.files import is_leftover
 
-#: Files that change after the run ends, and the checkpoints, which contain their own digests.
+#: Files without a line in SHA256SUMS. The checkpoints contain their own digests, and the other
+#: files change after the end of the run.
 _UNSEALED: Final = frozenset({SUMS, LOCK, LOG, CHECKPOINTS, SOURCES})
 
 

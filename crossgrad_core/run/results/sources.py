@@ -1,6 +1,6 @@
-"""Names in a run's folder for outside sources: other scenes and camera paths.
+"""Unique names for other scenes and camera paths, whose results are in a run's folder.
 
-Two sources may have the same name; their results must not replace each other.
+Two scenes or camera paths may have the same file name, but their results need different folders.
 """
 
 from json import dumps
@@ -10,19 +10,19 @@ from typing import Final
 from crossgrad_core.system.files import text_bytes, write_atomically
 from crossgrad_core.system.text_files import read_json
 
-#: The file that maps the name of a source to its path.
+#: The file that maps the name of a scene or camera path to its path.
 FILE: Final = "sources.json"
 #: The name of the built-in camera path, which does not come from a file.
 RESERVED: Final = ("zoom",)
 
 
 def name_for(folder: Path, name: str, source: Path) -> str:
-    """Return the name, with a number added if the name already belongs to another source.
+    """Return the name; add a number if the name already belongs to another source path.
 
     Args:
         folder: The run's folder, which stores the names.
-        name: Name of the source.
-        source: Path of the source.
+        name: Name of the scene or camera path.
+        source: Path of the scene or of the camera path's file.
 
     Raises:
         UserError: The disk is full.

@@ -1,4 +1,4 @@
-"""summary.json: the final results of a run with everything that is needed to understand them."""
+"""summary.json, which contains the final results of a run, its settings and its environment."""
 
 import json
 import math
@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
 FILE = "summary.json"
 Status = Literal["finished", "stopped", "failed"]
-#: Note that is added to every metric, because values are comparable only under the same definition.
+#: Definition of the compared images, because metrics of different programs are comparable only with
+#: equal definitions.
 RENDERS = "rounded to 8 bits per channel before comparison; masked pixels do not count"
 
 
@@ -33,15 +34,16 @@ class Summary:
     Attributes:
         status: Status of the run at its end.
         scene: Name of the scene.
-        totals: Steps, views, backward passes, training seconds, primitives, memory.
-        result: The last evaluation; None if there was none.
-        rows: All rows of metrics.csv; the best evaluation is found in them.
-        seconds: Wall-clock seconds by activity; training seconds also by phase.
+        totals: The cost of the run: steps, views, backward passes, time, primitives and memory.
+        result: The last evaluation; None without an evaluation.
+        rows: All rows of metrics.csv, from which the best evaluation is determined.
+        seconds: Wall-clock seconds of training, loading and other activities; training seconds also
+            by phase.
         config: The resolved configuration as plain data, including the seed.
-        environment: Machine and versions.
-        ply: Description of the PLY; None if none was written.
-        page: Name of the page that shows the scene in a browser; None if none was written.
-        notes: Choices and omissions, with their reasons.
+        environment: Data of the machine, and versions of packages.
+        ply: Description of the PLY file; None if no file was written.
+        page: Name of the page that shows the scene in a browser; None if no page was written.
+        notes: Messages about the run's choices, with reasons.
         decisions: The table of decided settings.
         check: Results of the consistency check of the scene; None without a check.
         error: The reason of the failure; None if the run did not fail.
@@ -64,7 +66,7 @@ class Summary:
 
 
 def write_summary(folder: Path, summary: Summary) -> None:
-    """Write summary.json; numbers that JSON cannot hold (NaN, infinity) become null.
+    """Write summary.json; NaN and infinity become null, because JSON cannot store these numbers.
 
     Raises:
         UserError: The disk is full.
@@ -77,7 +79,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
     """Return the content of a run's summary.json.
 
     Raises:
-        UserError: There is no such file, or it is not JSON.
+        UserError: The file does not exist, or it is not valid JSON.
     """
     path = folder / FILE
     if not path.is_file():
@@ -102,7 +104,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
 
 
 def summarised_step(folder: Path, status: Status | None = None) -> int | None:
-    """Return the step of summary.json and its files; None if the run has another status."""
+    """Return the step in summary.json; None without the file or if the run has another status."""
     try:
         summary = read_summary(folder)
     except UserError:
@@ -198,13 +200,13 @@ def cost_line(totals: Totals) -> str:
 
 
 def _rows(result: EvaluationResult) -> list[tuple[str, ...]]:
-    # A metric that is not defined for these views gets no column.
+    # Leave out metrics that are not defined for the views.
     shown = [
         figure for figure in result.figures if result.reasons.get(figure.name) != figure.undefined
     ]
     header = ("", "views", *(figure.label for figure in shown))
     rows = [header, _row("overall", result.overall, shown)]
-    # A single regime would only repeat the first row.
+    # Leave out a single regime, because its row would be equal to the first row.
     if len(result.regimes) > 1:
         rows += [_row(name, means, shown) for name, means in result.regimes.items()]
     return rows
@@ -220,7 +222,7 @@ def _number(value: float | None, form: str) -> str:
 
 
 def _shown(result: EvaluationResult) -> list[tuple[str, str]]:
-    """Return the reasons for missing metrics, for the metrics that are reported by regime."""
+    """Return pairs (name, reason) of missing metrics; omit metrics without values by regime."""
     reported_by_regime = [figure.name for figure in result.figures if figure.per_regime]
     return [(name, why) for name, why in result.reasons.items() if name in reported_by_regime]
 

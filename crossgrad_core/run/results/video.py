@@ -1,4 +1,4 @@
-"""Frames as image files and as a video."""
+"""Functions that write frames as image files and as a video."""
 
 import io
 import shutil
@@ -14,10 +14,11 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.system.files import atomic_file, disk_errors, write_atomically
 from crossgrad_core.system.interrupts import HELPERS
 
-#: The program that writes videos. Without this program, Pillow writes an animated image.
+#: The program that writes videos. If the program is missing, Pillow writes an animated image.
 ENCODER: Final = "ffmpeg"
 _QUALITY: Final = 85
-#: Maximum number of bytes of all frames of an animated image, which are in memory at the same time.
+#: Maximum total size of the frames of an animated image in bytes. All frames are in memory at the
+#: same time.
 _LARGEST: Final = 1 << 29
 #: Maximum side of an animated image in pixels.
 _LONGEST: Final = 16_383
@@ -28,7 +29,7 @@ def write_frames(images: Iterable[Tensor], folder: Path) -> list[Path]:
 
     Args:
         images: Images [H, W, 3] float; the values need not be clamped.
-        folder: The folder; created if needed.
+        folder: The folder of the images, which is created if it does not exist.
 
     Raises:
         UserError: The disk is full.
@@ -55,14 +56,14 @@ def drop_frames(folder: Path, count: int) -> None:
 
 
 def video_files(folder: Path) -> tuple[Path, Path]:
-    """Return the two possible paths of the video in a folder of frames: by ffmpeg, by Pillow."""
+    """Return the paths of a video by ffmpeg and of a video by Pillow in a folder of frames."""
     return folder / "video.mp4", folder / "video.webp"
 
 
 def write_video(frames: list[Path], fps: float) -> Path | None:
     """Write the frames as video.mp4 if ffmpeg is installed, else as video.webp; return the file.
 
-    Return None, and write no video, if the frames are too many or too large for an animated image.
+    Without ffmpeg, write no video and return None if there are too many or too large frames.
 
     Args:
         frames: PNG files named by their numbers from 0 on, in one folder.
@@ -80,10 +81,10 @@ def write_video(frames: list[Path], fps: float) -> Path | None:
 
 
 def _encode(encoder: str, frames: list[Path], target: Path, fps: float) -> None:
-    # The folder may also contain frames of an earlier, longer video.
+    # Limit the number of frames, because the folder may contain frames of an earlier, longer video.
     source = ["-framerate", f"{fps:g}", "-i", str(frames[0].parent / "%05d.png")]
     count = ["-frames:v", str(len(frames))]
-    # Players require even sides and this pixel format.
+    # Video players require even side lengths and the pixel format yuv420p.
     shape = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]
     command = [encoder, "-y", "-loglevel", "error", *source, *count, *shape, "-f", "mp4"]
     process = subprocess.Popen(
@@ -111,7 +112,7 @@ def _animated(frames: list[Path], path: Path, fps: float) -> Path | None:
     if size * len(frames) > _LARGEST or longest > _LONGEST:
         return None
     images = []
-    for frame in frames:  # Pillow needs all frames at once.
+    for frame in frames:  # Pillow requires all frames in memory.
         with Image.open(frame) as image:
             images.append(image.copy())
     with atomic_file(path) as file:

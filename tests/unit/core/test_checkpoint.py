@@ -359,7 +359,7 @@ def test_damage_is_reported_and_the_earlier_checkpoint_is_named(tmp_path: Path, 
     damage(newer)
     with pytest.raises(UserError, match=message) as told:
         load(newer)
-    assert f"remove it; the run then continues from {older.name}" in str(told.value)
+    assert f"remove this folder; the run then continues from {older.name}" in str(told.value)
 
 
 def test_another_format_version_is_refused(tmp_path: Path):

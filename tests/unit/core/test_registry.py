@@ -176,7 +176,7 @@ def test_a_name_that_two_packages_offer_is_refused_with_both_packages(good, inst
 def test_a_name_clash_with_crossgrad_asks_the_other_package_to_rename(install):
     install("made-up", {"samplers": {"random": "elsewhere:Good"}})
     error = refusal("samplers", "random")
-    assert "rename it in made-up" in error.todo
+    assert "rename the plugin in made-up" in error.todo
 
 
 def test_components_of_other_packages_are_listed_with_their_versions(good):

@@ -16,9 +16,7 @@ def rows_of(*figures):
 
 def test_a_better_earlier_evaluation_is_reported_with_step_and_time():
     (line,) = overdone(rows_of(18.0, 19.07, 18.12))
-    assert line.startswith(
-        "the last evaluation is 0.95 dB lower than at step 200, which had 19.07 dB after "
-    )
+    assert line.startswith("the last evaluation is 0.95 dB lower than at step 200 (19.07 dB after ")
     assert "25 s of training" in line and "--max-views" in line
 
 

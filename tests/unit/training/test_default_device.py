@@ -66,7 +66,7 @@ def test_a_gpu_is_selected_if_a_rasterizer_works_and_the_trial_runs_once(on_a_gp
         device, notes = device_of()
     assert device == "cuda"
     assert notes == (
-        f"device cuda: rasterizer gswarp works on {GPU} (use --device cpu to avoid it)",
+        f"device cuda: rasterizer gswarp works on {GPU} (use --device cpu to avoid the GPU)",
     )
     assert tried.devices == ["cuda"]
     assert "testing rasterizer gswarp on the GPU" in caplog.text
@@ -100,7 +100,7 @@ def test_the_cpu_is_used_if_the_gpu_rasterizer_does_not_work(on_a_gpu, error, wh
 @pytest.mark.parametrize(
     ("settings", "why"),
     [
-        ({"rasterizer": {"name": "numba"}}, "because rasterizer numba does not run on it"),
+        ({"rasterizer": {"name": "numba"}}, "because rasterizer numba does not run on the GPU"),
         ({"rasterizer": {"name": "gsplat"}}, "pip install 'crossgrad[gsplat]'"),
         ({"seconds": 9.0, "clock": "cpu"}, "because --clock cpu does not count the time of a GPU"),
         (

@@ -208,7 +208,7 @@ def test_max_gaussians_does_not_limit_a_ply_start(tmp_path):
     with pytest.raises(UserError) as caught:
         refusal({**settings, "densifier": {"name": "none"}})
     assert caught.value.where == "max_gaussians"
-    assert "a PLY is used unchanged" in caught.value.found
+    assert "the Gaussians of a PLY file are used unchanged" in caught.value.found
 
 
 @pytest.mark.parametrize("slot", ["backbones", "samplers", "operators", "rasterizers"])
