@@ -14,6 +14,7 @@ from PIL import Image
 from support.chromium import Page, found
 from support.gaussians import posed_camera, random_gaussians
 
+import crossgrad_core as cg
 from crossgrad_core.plugin import ExportContent, Similarity, View, to_uint8
 from crossgrad_plugins.exporters.html import Html
 from crossgrad_plugins.rasterizers.numba_cpu import NumbaRasterizer
@@ -83,16 +84,20 @@ def decibels(image, other):
     return 10 * np.log10(255**2 / max(((image - other) ** 2).mean(), 1e-9))
 
 
+def wrong(image):
+    """Every flipped and every channel-swapped version of an image."""
+    swapped = [image[:, :, list(order)] for order in permutations(range(3)) if order != (0, 1, 2)]
+    return [image[::-1], image[:, ::-1], image[::-1, ::-1], *swapped]
+
+
 def assert_drawn_as_ours(page, gaussians, views, at_least=50.0):
     for number, view in enumerate(views):
         seen, ours = picture(page, number), rendered(gaussians, view.camera)
         assert ours.std() > 10.0
         assert seen.shape == ours.shape
         agreement = decibels(seen, ours)
-        wrong = [seen[::-1], seen[:, ::-1], seen[::-1, ::-1]]
-        wrong += [seen[:, :, list(order)] for order in permutations(range(3)) if order != (0, 1, 2)]
         assert agreement >= at_least
-        assert agreement > 10.0 + max(decibels(image, ours) for image in wrong)
+        assert agreement > 10.0 + max(decibels(image, ours) for image in wrong(seen))
 
 
 @pytest.mark.parametrize(
@@ -271,3 +276,21 @@ def test_hostile_names_are_shown_as_text(page, tmp_path):
 def test_the_page_allows_no_network_even_to_its_own_code(page, small):
     page.value("fetch('http://127.0.0.1:9/').catch(() => 0)")
     assert any("Content Security Policy" in problem for problem in page.problems)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backbone", ["vanilla", "mip"])
+def test_the_page_of_a_run_shows_its_training_cameras_as_the_run_renders_them(
+    page, tmp_path, backbone
+):
+    run = cg.run(backbone=backbone, steps=150, max_size=320, out=tmp_path / "run", quiet=True)
+    page.open((run.folder / run.summary["page"]).as_uri())
+    page.value("ready")
+    views = run.scene.train_views
+    for number in (0, len(views) // 2, len(views) - 1):
+        # Without the exposure of the photo, which no file contains.
+        ours = to_uint8(torch.from_numpy(run.render(views[number].camera))).numpy().astype(float)
+        seen = picture(page, number)
+        assert decibels(seen, ours) > 38.0
+        assert decibels(seen, ours) > 10.0 + max(decibels(image, ours) for image in wrong(seen))
+    assert page.problems == []

@@ -48,7 +48,7 @@ def test_a_large_scene_gets_no_page_and_loses_an_old_one(scene, tmp_path, monkey
     assert run(scene, out, stop_after=2) == 0
     assert (out / "point_cloud.html").is_file()
     monkeypatch.setattr(export, "MOST_PAGE_BYTES", 1000)
-    app.resumed(out, {}, app.Way(-1))
+    assert app.run({}, resume=out, verbosity=-1) == 0
     assert summary(out)["status"] == "finished"
     assert summary(out)["page"] is None
     assert not (out / "point_cloud.html").exists()
