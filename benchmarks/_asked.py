@@ -13,23 +13,23 @@ from crossgrad_plugins.sweep.grid import Choice, Grid
 from crossgrad_plugins.sweep.job import Layout
 from crossgrad_plugins.sweep.summary import earlier_rows
 
-#: Values with which a run decides a setting at its start.
+#: Values that mean that a run decides a setting at its start.
 _LEFT_OPEN: Final = ("auto", ABSENT)
 #: Settings that are not compared: paths, which may be relative to the folder of the grid, and
-#: `plan`, which a run replaces.
+#: `plan`, which a run changes.
 _OTHERWISE: Final = ("exposure_from", "data.init", "plan")
 
 
 @dataclass(frozen=True)
 class Asked:
-    """The settings that a grid names for an arm on a scene.
+    """The settings that a grid gives to an arm on a scene.
 
-    Settings that the grid does not name may have any value.
+    Settings that the grid does not give may have any value.
 
     Attributes:
         config: The configuration.
-        settings: The named settings that can define an arm.
-        has_length: True if a length is named.
+        settings: The given settings that can define an arm.
+        has_length: True if the grid gives a length.
     """
 
     config: RunConfig
@@ -40,13 +40,13 @@ class Asked:
     def of(
         cls, grid: Grid, choice: Choice, scene: str | None, assignments: Sequence[str] = ()
     ) -> "Asked":
-        """Return the settings that the grid names, without reading the scene.
+        """Return the settings that the grid gives; the scene is not read.
 
         Args:
             grid: The grid.
             choice: A configuration of the grid.
             scene: A scene of the grid.
-            assignments: `KEY=VALUE` texts that override the grid.
+            assignments: Texts `KEY=VALUE` that override the grid.
 
         Raises:
             UserError: A setting does not exist or has a wrong value.
@@ -57,9 +57,9 @@ class Asked:
         return cls(config, named, bool(LENGTHS & settings.keys()))
 
     def fits(self, run: Run) -> bool:
-        """Return True if a run uses all named settings.
+        """Return True if a run uses all given settings.
 
-        A setting that is undecided or unknown counts as a match.
+        A setting that is not decided yet, or is unknown, counts as equal.
         """
         return (not self.has_length or self._fits_length(run)) and all(
             asked in {run.settings.get(name, asked), *_LEFT_OPEN}
@@ -83,7 +83,7 @@ class Asked:
 
 
 def of_earlier_grids(runs: Sequence[Run]) -> frozenset[Run]:
-    """Return the runs that the table of their sweep assigns to earlier grids.
+    """Return the runs that belong to earlier grids, according to the table of their sweep.
 
     Raises:
         UserError: A table cannot be read.
@@ -104,10 +104,11 @@ def asked_for(runs: Sequence[Run], asked: Asked, earlier: frozenset[Run]) -> lis
 
     Args:
         runs: The runs.
-        asked: The settings that the grid names.
-        earlier: Runs of earlier grids, by the table of their sweep. If all runs belong to earlier
-            grids, no run is returned, because the current run has not ended. If a current run
-            exists but does not fit, the table belongs to another grid and is ignored.
+        asked: The settings that the grid gives.
+        earlier: Runs of earlier grids, according to the table of their sweep. If all runs belong to
+            earlier grids, no run is returned, because the run of the present grid has not ended. If
+            the run of the present grid exists but does not fit, the table belongs to another grid
+            and is ignored.
     """
     fitting = [run for run in runs if asked.fits(run)]
     current = [run for run in fitting if run not in earlier]
@@ -138,7 +139,7 @@ def only(runs: Sequence[Run], label: str) -> Run:
 
 
 def _difference(first: Run, second: Run) -> str:
-    """Return the differences in settings that both runs have, or an empty text."""
+    """Return the differences of settings that both runs have; empty without differences."""
     found = [
         f"{name} {value} against {second.settings[name]}"
         for name, value in first.settings.items()

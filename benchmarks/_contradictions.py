@@ -1,4 +1,4 @@
-"""Correct scenes in memory, and changes after which a scene contradicts itself."""
+"""Correct scenes in memory, and changes that make a scene contradict itself."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from crossgrad_core.scene.frame import make_frame
 
 Floats: TypeAlias = NDArray[np.float64]
 Photo: TypeAlias = NDArray[np.uint8]
-#: One photo out of this many photos is held out.
+#: One of this many photos is held out.
 EVERY: Final = 8
 _FLIP: Final = np.diag([1.0, -1.0, -1.0])
 
@@ -38,16 +38,16 @@ class MemoryPhoto:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A scene as a reader returns it, including its photos.
+    """A scene in the form that a reader returns, with its photos.
 
     Attributes:
-        rotations: [V, 3, 3] world to camera.
-        translations: [V, 3].
-        calibrations: [V, 4] fx, fy, cx, cy.
-        photos: [V] of [H, W, 3].
-        seen: [V] indices of the points that each view observes.
-        points: [P, 3].
-        colors: [P, 3] uint8.
+        rotations: [V, 3, 3] rotations from world to camera.
+        translations: [V, 3] translations from world to camera.
+        calibrations: [V, 4] focal lengths and principal points: fx, fy, cx, cy.
+        photos: [V] images [H, W, 3].
+        seen: [V] indices of the points that each view observed.
+        points: [P, 3] positions.
+        colors: [P, 3] uint8 colours.
     """
 
     rotations: Floats
@@ -129,13 +129,13 @@ class Model:
 
 @dataclass(frozen=True)
 class Wrong:
-    """A model that contradicts itself.
+    """A scene that contradicts itself.
 
     Attributes:
-        model: The model.
-        strength: Strength of the contradiction, as a text for the table.
-        views: The wrong views, or an empty set if all views are wrong.
-        causes: The correct cause contains at least one of these words.
+        model: The changed scene.
+        strength: Size of the change, as a text for the table.
+        views: The changed views; empty if all views are changed.
+        causes: Words of which at least one must be in the reported cause.
     """
 
     model: Model
@@ -169,7 +169,7 @@ def camera_to_world(model: Model, _: np.random.Generator) -> Wrong:
 
 
 def exchanged(model: Model, rng: np.random.Generator) -> Wrong:
-    """Exchange pairs of photos."""
+    """Exchange photos in pairs."""
     views = rng.permutation(len(model.photos))[
         : 2 * int(rng.integers(1, max(2, len(model.photos) // 5)))
     ]
@@ -207,7 +207,7 @@ def rotated(model: Model, rng: np.random.Generator) -> Wrong:
 
 
 def focal(model: Model, rng: np.random.Generator) -> Wrong:
-    """Multiply the focal length by a wrong factor."""
+    """Multiply the focal length by a factor."""
     factor = float(rng.choice([0.5, 0.7, 0.8, 0.9, 0.95, 1.05, 1.1, 1.25, 1.5, 2.0]))
     wrong = replace(model, calibrations=model.calibrations * [factor, factor, 1, 1])
     causes = ("focal", "another size")
@@ -215,7 +215,7 @@ def focal(model: Model, rng: np.random.Generator) -> Wrong:
 
 
 def nonsense(model: Model, rng: np.random.Generator) -> Wrong:
-    """Rotate cameras by some angle."""
+    """Rotate cameras by random angles."""
     views, angle = some_views(model, rng), float(rng.choice([10.0, 30.0, 180.0]))
     rotations = model.rotations.copy()
     for view in views:
@@ -253,7 +253,7 @@ def shifted(model: Model, rng: np.random.Generator) -> Wrong:
 
 
 def half_elsewhere(model: Model, rng: np.random.Generator) -> Wrong:
-    """Exchange the poses of one half of the photos among each other."""
+    """Exchange the poses within one half of the photos."""
     views = rng.permutation(len(model.photos))[: len(model.photos) // 2]
     photos = list(model.photos)
     for a, b in zip(views, np.roll(views, 1), strict=True):
@@ -262,7 +262,7 @@ def half_elsewhere(model: Model, rng: np.random.Generator) -> Wrong:
 
 
 def points_y_z(model: Model, _: np.random.Generator) -> Wrong:
-    """Exchange y and z of the points, so that their axes differ from the axes of the poses."""
+    """Exchange y and z of the points, so that points and poses have different axes."""
     matrix = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     return Wrong(
         replace(model, points=model.points @ matrix.T), "all", frozenset(), ("other axes",)
@@ -286,7 +286,7 @@ KINDS: Final[dict[str, Kind]] = {
 
 
 def varied(model: Model, rng: np.random.Generator) -> Model:
-    """Vary a correct scene: fewer photos and points, cropped or stretched photos, no tracks."""
+    """Vary a correct scene: fewer photos or points, cropped or stretched photos, no tracks."""
     count = int(rng.integers(8, len(model.photos) + 1))
     model = model.views(np.sort(rng.choice(len(model.photos), count, replace=False)))
     if rng.random() < 0.5:
@@ -301,7 +301,7 @@ def varied(model: Model, rng: np.random.Generator) -> Model:
 
 
 def harmless(model: Model, rng: np.random.Generator) -> Model:
-    """Change light, noise, JPEG quality or frame, without a contradiction."""
+    """Change light, noise, JPEG quality or coordinate frame; the scene stays correct."""
     photos = list(model.photos)
     if rng.random() < 0.5:
         gains = 2.0 ** rng.normal(0.0, 0.5, len(photos))

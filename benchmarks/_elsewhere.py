@@ -1,4 +1,7 @@
-"""Evaluate runs on another capture of the same place, and store metrics with their origin."""
+"""Evaluate runs on another capture of the same place.
+
+The metrics are stored together with their origin.
+"""
 
 import csv
 import json
@@ -19,7 +22,7 @@ from crossgrad_plugins.compare.run import Run
 if TYPE_CHECKING:
     from crossgrad_core.contract.scene import Scene
 
-#: Origin of a table, as stored in the JSON file next to it.
+#: Origin of a table, stored in a JSON file beside the table.
 Origin: TypeAlias = dict[str, object]
 PLY = "point_cloud.ply"
 
@@ -29,9 +32,9 @@ class Capture:
     """A capture of a place.
 
     Attributes:
-        path: Its folder.
+        path: Folder of the capture.
         scene: The scene, without held-out views.
-        digest: Fingerprint of the scene for this size of photos, independent of its path.
+        digest: Fingerprint of the scene for this size of photos, which does not depend on its path.
     """
 
     path: Path
@@ -56,9 +59,9 @@ class Table:
     """The metric values of a run on the views of another capture, with one row per view.
 
     Attributes:
-        run: The run.
-        capture: The capture.
-        file: True to draw the run's PLY on black, False to draw its model.
+        run: The evaluated run.
+        capture: The capture that gives the views.
+        file: True to draw the PLY of the run on black, False to draw the model.
     """
 
     run: Run
@@ -67,19 +70,19 @@ class Table:
 
     @property
     def path(self) -> Path:
-        """Path of the table, as named by `crossgrad eval RUN --on SCENE`."""
+        """The path of the table that `crossgrad eval RUN --on SCENE` writes."""
         what = "of_ply_on" if self.file else "on"
         return self.run.results.folder / f"per_view_{what}_{self.capture.path.absolute().name}.csv"
 
     @property
     def is_unmarked(self) -> bool:
-        """True if the table has no record of its origin, like tables of `crossgrad eval`."""
+        """True if the table has no record of its origin, as after a plain `crossgrad eval`."""
         return self._origin() is None
 
     def figures(self, name: str) -> dict[str, float]:
         """Return the metric value of each photo.
 
-        The run is evaluated if the table has another origin.
+        The run is evaluated again if the origin of the table is another one.
 
         Raises:
             UserError: The metric does not exist, or the run cannot be evaluated.
@@ -100,13 +103,13 @@ class Table:
         origin = self._origin()
         if origin is not None:
             return all(origin.get(key) == value for key, value in self._wanted().items())
-        # Old tables have no record of their origin. They are accepted if their runs cannot be
+        # Old tables have no record of their origin. They are accepted only if the run cannot be
         # evaluated again.
         views = {view.name for view in self.capture.scene.views}
         return not self._has_checkpoint() and all(row["name"] in views for row in self._rows())
 
     def _origin(self) -> Origin | None:
-        """Return the table's origin, or None if its record is missing or outdated."""
+        """Return the origin of the table; None if the record is missing or outdated."""
         path = self.path.with_suffix(".json")
         if not path.is_file():
             return None
@@ -115,7 +118,7 @@ class Table:
         return dict(found) if isinstance(found, dict) and written else None
 
     def _wanted(self) -> Origin:
-        """Return the origin that the table must have, without the PLY if the file is missing."""
+        """Return the origin that the table must have; without the PLY if the file is missing."""
         wanted: Origin = {"scene": self.capture.digest, "step": self.run.number("step")}
         ply = self.run.results.folder / PLY
         if self.file and ply.is_file():

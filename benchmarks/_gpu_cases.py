@@ -1,4 +1,4 @@
-"""The cases of benchmarks/gpu.py, and the stops of its long runs."""
+"""The cases of benchmarks/gpu.py, and the evaluated steps of its long runs."""
 
 import sys
 from collections.abc import Iterator, Sequence
@@ -7,7 +7,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-#: The last rasterizer is the reference in plain torch. It is measured only for K = 1.
+#: The last rasterizer is the reference in plain torch. The reference is measured only for K = 1.
 RASTERIZERS = ("gsplat", "gswarp", "torch")
 BACKBONES = ("vanilla", "pixel", "mip", "distance", "scaffold", "octree")
 VIEWS = (1, 2, 4, 8)
@@ -16,22 +16,22 @@ OPERATORS = ("sum", "mean", "pcgrad", "cagrad", "upgrad", "symmetric")
 SIZES, PIXELS = (100_000, 1_000_000, 3_000_000), 1.0
 #: Lengths of runs with the default settings of `crossgrad run`.
 USUAL = (1_000, 7_000, 30_000)
-#: Steps of a long run that get a row in the table, in addition to the last step.
+#: Steps of a long run that get a row in the table, besides the last step.
 STOPS = (7_000, 15_000)
 
 
 @dataclass(frozen=True)
 class Case:
-    """A row of the table.
+    """A measured case: one row of the table.
 
     Attributes:
         part: `sizes`, `steps`, `long` or `usual`.
         rasterizer: Name of the rasterizer.
         backbone: Name of the backbone.
-        views: K.
+        views: Number K of views per step.
         operator: Name of the operator.
         steps: Number of measured steps.
-        gaussians: Number of Gaussians of a random cloud, or 0 for SCENE.
+        gaussians: Number of Gaussians of a random cloud; 0 for the scene of the command line.
     """
 
     part: str
@@ -44,7 +44,7 @@ class Case:
 
     @property
     def name(self) -> str:
-        """Name of the folder with the runs of the case."""
+        """The name of the folder with the runs of the case."""
         split = ("every",) if self.part in {"long", "usual"} else ()
         return "-".join(map(str, (*vars(self).values(), *split)))
 
@@ -59,7 +59,7 @@ class Case:
             "--steps": self.steps,
             "--metrics": "psnr",
             "--out": out,
-            # If the photos are in one folder, gsplat holds out the same photos.
+            # If all photos are in one folder, gsplat holds out the same photos as crossgrad.
             "--split": "every",
             "--eval-every": max(1, min(1_000, self.steps // 7)),
         }
@@ -102,10 +102,10 @@ def cases(steps: int, long: int) -> Iterator[Case]:
 
 
 def is_chosen(case: Case, only: Sequence[str] | None) -> bool:
-    """Return True if a case's name contains one of the texts, or if no texts are given."""
+    """Return True if a case's name contains one of the texts, or if there are no texts."""
     return not only or any(text in case.name for text in only)
 
 
 def stops(steps: int) -> tuple[int, ...]:
-    """Return the steps of a long run that have a row in the table."""
+    """Return the steps of a long run that get a row in the table."""
     return (*(stop for stop in STOPS if stop < steps), steps)

@@ -1,4 +1,4 @@
-"""gsplat's own trainer, started from the folder of its examples, and its statistics."""
+"""gsplat's own trainer, started from the folder of its examples, and its results."""
 
 import json
 import subprocess
@@ -10,7 +10,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Stop:
-    """Figures of the trainer after a number of steps.
+    """Results of the trainer after a number of steps.
 
     Attributes:
         step: Number of steps.
@@ -18,7 +18,7 @@ class Stop:
         psnr: PSNR of the held-out photos in dB, or None without an evaluation.
         gaussians: Number of Gaussians.
         mib: Peak memory of the GPU in MiB.
-        file: File that contains these figures.
+        file: File with these results.
     """
 
     step: int
@@ -32,15 +32,15 @@ class Stop:
 def trained(
     examples: Path, scene: Path, runs: Path, stops: Sequence[int], limit: float | None
 ) -> tuple[list[Stop], str]:
-    """Train to the last stop, unless the results of the last stop exist.
+    """Train to the last stop, unless results of the last stop exist.
 
-    Return the reached stops and a failure.
+    Return the stops that were reached, and the reason of a failure.
 
     Args:
         examples: The folder of gsplat's examples.
         scene: The COLMAP scene. Photos keep their size.
-        runs: Folder in which the result folder is made.
-        stops: Steps at which the trainer evaluates and saves. The last stop ends the training.
+        runs: Folder for the result folder.
+        stops: Steps at which the trainer evaluates and saves; training ends after the last one.
         limit: Seconds after which the trainer is stopped.
     """
     folder, why = runs / f"gsplat-trainer-{stops[-1]}", ""
@@ -75,7 +75,7 @@ def _told(folder: Path, step: int) -> Path:
 
 
 def _failure(command: list[str], folder: Path, limit: float | None) -> str:
-    """Run a command in a folder. Return the reason of a failure, or an empty text."""
+    """Run a command in a folder. Return the reason if the command failed, else an empty text."""
     try:
         ended = subprocess.run(
             command, cwd=folder, capture_output=True, text=True, check=False, timeout=limit

@@ -1,4 +1,4 @@
-"""Facts about the machine and the process that are part of every benchmark line."""
+"""Facts about the machine and the process, which every benchmark prints."""
 
 import os
 import platform
@@ -48,7 +48,7 @@ def _git(root: Path, *arguments: str) -> str:
 
 
 def peak_mib() -> float:
-    """Return the largest resident memory of this process so far, in MiB (NaN on Windows)."""
+    """Return the peak resident memory of this process, MiB (NaN on Windows)."""
     if sys.platform == "win32":
         return float("nan")
     import resource

@@ -1,4 +1,4 @@
-"""The paper's claims with their tests, its tables, and the plan of `make paper`, as data."""
+"""The paper's claims and tables with their tests, and the plan of `make paper`, as data."""
 
 import csv
 from collections.abc import Iterator, Mapping
@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 HERE = Path(__file__).parent
 DATA = HERE / "paper_data"
-#: Number of methods that are also run and compared on each of the other backbones.
+#: Number of methods that are also compared on each of the other backbones.
 BEST = 2
 #: Folder of the grids that are stored in the repository.
 GRIDS = HERE / "grids" / "paper"
@@ -30,7 +30,7 @@ class Pairing(_Part):
     Attributes:
         first: Name of an arm.
         second: Name of another arm.
-        scenes: Scenes that count, or empty for all scenes that both arms have.
+        scenes: Scenes that count; empty for all scenes that both arms have.
     """
 
     first: str
@@ -39,11 +39,11 @@ class Pairing(_Part):
 
 
 class Reading(_Part):
-    """A value of diagnostics.csv, averaged over the probes of a run.
+    """A column of diagnostics.csv, averaged over the probes of a run.
 
     Attributes:
         column: Column of the table.
-        block: Block of the gradients. `each` also averages over single blocks.
+        block: Block of the gradients; `each` averages over all single blocks.
         metric: Metric in which gradients are measured.
     """
 
@@ -57,9 +57,9 @@ class Probe(_Part):
 
     Attributes:
         arm: Name of the arm, which uses the observer `diagnostics`.
-        first: The figure.
+        first: The statistic.
         second: The statistic that is subtracted, or None.
-        scenes: Scenes that count, or empty for all.
+        scenes: Scenes that count; empty for all.
     """
 
     arm: str
@@ -69,17 +69,17 @@ class Probe(_Part):
 
 
 class Arithmetic(_Part):
-    """A statement about the paper's own tables: a method closes a certain share of a gap.
+    """A statement about the paper's own numbers: a method closes a certain share of a gap.
 
     Attributes:
-        table: Table that contains `method` and `base`.
+        table: Table with the rows `method` and `base`.
         method: The row that closes the gap.
         base: The row at which the gap starts.
-        target_table: Table that contains `target`.
+        target_table: Table with the row `target`.
         target: The row at which the gap ends.
-        low: The smallest share.
-        high: The largest share.
-        scenes: Number of scenes for which the statement has to be true.
+        low: Lower bound of the share.
+        high: Upper bound of the share.
+        scenes: Number of scenes for which the statement must be true.
     """
 
     table: str
@@ -93,15 +93,15 @@ class Arithmetic(_Part):
 
 
 class Check(_Part):
-    """A test of a statement, of exactly one of four kinds.
+    """The test of a statement; exactly one of its first four fields is set.
 
     Attributes:
-        test: Two arms.
+        test: The two arms that are compared.
         probe: A statistic of the gradients.
-        arithmetic: The paper's own figures.
+        arithmetic: A statement about the paper's own numbers.
         none: Reason why the statement is not tested.
-        expected: The statement about `test`, or about the sign of `probe`.
-        within: The bounds for the value of `probe` in the statement.
+        expected: The expected relation of the two arms in `test`, or the expected sign of `probe`.
+        within: The expected bounds of `probe`.
         margin: Largest difference that counts as equal, or None for 0.1 dB.
     """
 
@@ -126,7 +126,7 @@ class Check(_Part):
 
     @property
     def arms(self) -> tuple[str, ...]:
-        """The arms whose runs the check needs."""
+        """The arms whose runs are needed for the test."""
         if self.test is not None:
             return self.test.first, self.test.second
         return () if self.probe is None else (self.probe.arm,)
@@ -136,9 +136,9 @@ class Claim(Check):
     """A statement of the paper's text.
 
     Attributes:
-        id: A short name, unique.
-        where: Section or table of the paper that contains the statement.
-        says: The statement.
+        id: A unique short name.
+        where: Section or table of the paper with the statement.
+        says: Text of the statement.
     """
 
     id: str
@@ -147,14 +147,14 @@ class Claim(Check):
 
 
 class Row(_Part):
-    """A test of a row of a table.
+    """The test of one row of a table.
 
     Attributes:
         first: The arm that represents the row.
-        second: The arm that represents the reference, only used with `first`.
-        probe: A statistic of the gradients that is used instead.
+        second: The arm that represents the reference; only used together with `first`.
+        probe: A statistic of the gradients that is tested instead of two arms.
         none: Reason why the row is not tested.
-        expected: The row's statement about the sign of `probe`.
+        expected: The expected sign of `probe`, as in the row.
         margin: Largest difference of `probe` that counts as equal.
     """
 
@@ -166,7 +166,7 @@ class Row(_Part):
     margin: float | None = None
 
     def check(self, expected: Expected) -> Check:
-        """Return the row as a check, if the paper's figures say `expected`."""
+        """Return the row as a check; `expected` is the relation in the paper's numbers."""
         if self.first is not None and self.second is not None:
             return Check(test=Pairing(first=self.first, second=self.second), expected=expected)
         return Check(probe=self.probe, none=self.none, expected=self.expected, margin=self.margin)
@@ -178,8 +178,8 @@ class Table(_Part):
     Attributes:
         id: Label of the table.
         title: Topic of the table.
-        reference: The method with which the rows are compared, or None if rows are gains already.
-        note: Remarks for the reader.
+        reference: The method with which rows are compared; None if the rows already are gains.
+        note: Remarks for readers.
         rows: Method -> its test.
     """
 
@@ -191,7 +191,7 @@ class Table(_Part):
 
 
 class Section(_Part):
-    """Claims that are judged together."""
+    """Claims whose p-values are corrected together."""
 
     title: str
     claims: tuple[Claim, ...]
@@ -201,7 +201,7 @@ class Claims(_Part):
     """All claims of the paper.
 
     Attributes:
-        source: The paper.
+        source: The paper's title and address.
         untestable: Reason why values on the paper's scenes are not tested.
         recipes: Scenes of the paper -> instructions for readers who have these scenes.
         tables: Tables of the paper.
@@ -223,13 +223,13 @@ class Claims(_Part):
 
 
 class BestOf(_Part):
-    """A grid whose arms are run with the best methods that other grids have measured.
+    """A grid whose arms use the best methods of other grids.
 
     Attributes:
         grid: The grid.
         candidates: Arms from which the best methods are chosen.
-        scaffold_like: Backbone -> tuned arms whose learning rates the backbone uses, for one view
-            and for more views.
+        scaffold_like: Backbone -> tuned arms whose learning rates this backbone uses, for one view
+            and for several views.
     """
 
     grid: str
@@ -243,9 +243,9 @@ class Plan(_Part):
     Attributes:
         tuning: The grid that gives the factors of the learning rates.
         grids: The measured grids, in order.
-        rates: Arm -> the tuned arm whose factors of the learning rates the arm uses. `default`
-            applies to other arms.
-        fixed_rates: Grids whose arms set their own learning rates.
+        rates: Arm -> the tuned arm whose learning-rate factors it uses. The key `default` applies
+            to all other arms.
+        fixed_rates: Grids whose arms already contain learning rates.
         best_of: The grid that depends on the results of the other grids.
     """
 
@@ -258,14 +258,14 @@ class Plan(_Part):
 
 @dataclass(frozen=True)
 class Figure:
-    """A number that the paper reports for a scene and a metric."""
+    """A number in the paper, for a scene and a metric."""
 
     scene: str
     metric: str
     value: float | None
 
 
-#: Table -> method -> its values, in the order of the paper.
+#: Table -> method -> its numbers, in the order of the paper.
 Tables: TypeAlias = Mapping[str, Mapping[str, list[Figure]]]
 
 
@@ -282,7 +282,7 @@ def read_plan() -> Plan:
 
 
 def read_tables() -> Tables:
-    """Return the values of the paper's tables."""
+    """Return the numbers of the paper's tables."""
     found: dict[str, dict[str, list[Figure]]] = {}
     with (DATA / "tables.csv").open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
@@ -293,7 +293,7 @@ def read_tables() -> Tables:
 
 
 def values(tables: Tables, table: str, method: str, metric: str) -> dict[str, float]:
-    """Return the value of a method for each scene, without scenes that have no value."""
+    """Return the number of a method for each scene that has one."""
     return {
         figure.scene: figure.value
         for figure in tables[table][method]

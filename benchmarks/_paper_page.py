@@ -1,4 +1,4 @@
-"""The page docs/results/paper.md: all tables and claims, with our figures and verdicts."""
+"""The page docs/results/paper.md: all tables and claims, with our results and verdicts."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,7 +26,7 @@ EQUAL = {
         "one view, 2x stretched, published rates",
     ),
 }
-#: Differences in the paper count as equal if they are below this value, in dB.
+#: Differences in the paper below this value, in dB, count as equal.
 _SAME = 0.1
 _HEAD = "| {} | the paper | command | ours | verdict |"
 
@@ -38,7 +38,7 @@ def page(claims: Claims, results: Results, tables: Tables, extra: Sequence[str] 
         claims: The paper's claims.
         results: The results of the grids.
         tables: The values of the paper.
-        extra: Arms of the other backbones, in pairs by backbone.
+        extra: Pairs of arms of the other backbones, by backbone.
     """
     blocks = [_table(table, claims, results, tables) for table in claims.tables]
     sections = [
@@ -185,7 +185,7 @@ def _command(check: Check, results: Results) -> str:
 
 
 def _expected(tables: Tables, table: Table, method: str) -> Expected:
-    """Return the relation between a row and the table's reference, from their mean difference."""
+    """Return the relation between a row and the table's reference in the paper's numbers."""
     found = _differences(tables, table, method)
     mean = fmean(found.values()) if found else 0.0
     if abs(mean) < _SAME:
@@ -194,9 +194,9 @@ def _expected(tables: Tables, table: Table, method: str) -> Expected:
 
 
 def _differences(tables: Tables, table: Table, method: str) -> dict[str, float]:
-    """Return PSNR minus the reference's PSNR for each scene.
+    """Return the PSNR minus the PSNR of the reference, for each scene.
 
-    A table of gains already contains these differences.
+    If a table contains gains, its numbers already are these differences.
     """
     gains = values(tables, table.id, method, "PSNR_gain")
     if gains or table.reference is None:
@@ -225,7 +225,7 @@ def _figures(tables: Tables, table: str, method: str) -> str:
 
 
 def _second_view(results: Results) -> Iterator[str]:
-    """Yield a table that shows the gain of the second view, at equal steps, views and seconds."""
+    """Yield a table of the gain of a second view, at equal steps, views and seconds."""
     yield from (
         "## Gain of the second view by scene",
         "",
@@ -238,7 +238,7 @@ def _second_view(results: Results) -> Iterator[str]:
         for scene in _scenes(results)
         for name, (a, b) in EQUAL.items()
     }
-    # All rows of the table belong to one family of comparisons.
+    # The p-values of all rows of the table are corrected together.
     whole = [
         key
         for key, each in contrasts.items()
@@ -258,7 +258,7 @@ def _second_view(results: Results) -> Iterator[str]:
 
 
 def _lacking(results: Results, scene: str, name: str) -> str:
-    """Return the number of finished pairs of an unfinished comparison, or an empty text."""
+    """Return the number of finished pairs if a comparison is unfinished, else an empty text."""
     wanted, missing = results.missing(EQUAL[name], (scene,))
     if not wanted:
         return ": in no grid"
@@ -365,7 +365,7 @@ def _cell(row: Mapping[str, str], column: str) -> str:
 
 
 def _trajectories(results: Results) -> Iterator[str]:
-    """Yield a table of conflicts, ratios and variances over training, one row per probe."""
+    """Yield a table of conflicts, ratios and variances during training, one row per probe."""
     yield from ("## Trajectories", "")
     rows = [line for arm in WATCHED for line in _trajectory(arm, results)]
     if not rows:
@@ -401,7 +401,7 @@ def _trajectory(arm: str, results: Results) -> Iterator[str]:
 
 
 def _probe(tables: Sequence[Sequence[Mapping[str, str]]], run: Run) -> Iterator[str]:
-    """Yield the cells of one probe. `tables` contains its rows for each seed."""
+    """Yield the cells of one probe. `tables` contains the rows of the probe for each seed."""
 
     def over_seeds(column: str, block: str) -> str:
         reading = Reading(column=column, block=block)
@@ -419,7 +419,7 @@ def _probe(tables: Sequence[Sequence[Mapping[str, str]]], run: Run) -> Iterator[
 def _with_interval(row: Mapping[str, str], column: str) -> str:
     """Return an estimate with its 95 % interval.
 
-    If the estimate is negative, the text says that there is no interval.
+    For a negative estimate, the text says that there is no interval.
     """
     value, low, high = (row.get(f"{column}{end}", "") for end in ("", "_low", "_high"))
     # Tables from before 2026-11-25 contain [0, 0] if the estimate is below 0.

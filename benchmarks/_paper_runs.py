@@ -1,4 +1,4 @@
-"""Runs of the paper's grids by arm, and the runs that are still missing."""
+"""The runs of the paper's grids by arm, and the runs that are still missing."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,10 +27,10 @@ class Results:
 
     Attributes:
         runs: Arm -> scene and seed -> finished run.
-        planned: Arm -> scenes and seeds in its grid.
+        planned: Arm -> scenes and seeds that its grid requests.
         failed: Arm -> scenes and seeds whose run failed.
         grids: Arm -> its grid.
-        left_out: Arm -> folders of its runs that the grid does not request.
+        left_out: Arm -> folders of runs that its grid does not request.
     """
 
     runs: Mapping[str, Runs]
@@ -40,7 +40,7 @@ class Results:
     left_out: Mapping[str, tuple[Path, ...]] = field(default_factory=dict)
 
     def missing(self, arms: Sequence[str], scenes: Sequence[str] = ()) -> tuple[int, int]:
-        """Return two numbers: pairs (scene, seed) that the arms share, and missing pairs."""
+        """Return the number of (scene, seed) pairs of the arms, and how many are missing."""
         shared = frozenset.intersection(*(self.planned.get(arm, frozenset()) for arm in arms))
         wanted = {each for each in shared if not scenes or each[0] in scenes}
         ended = {
@@ -59,9 +59,9 @@ def read_results(
     """Read the runs of all existing sweeps.
 
     Args:
-        sweeps: Grid -> folder of its sweep, which may be missing.
+        sweeps: Grid -> folder of its sweep, if it exists.
         grids: Grid -> its content.
-        assignments: `KEY=VALUE` texts with which the sweeps were started.
+        assignments: Texts `KEY=VALUE` with which the sweeps were started.
 
     Raises:
         UserError: Runs of one scene differ in views or photos, a file is damaged, or an arm has
@@ -102,7 +102,7 @@ def _chosen(
     dict[str, frozenset[tuple[str, int]]],
     dict[str, tuple[Path, ...]],
 ]:
-    """Return for each arm the requested, the failed and the unrequested runs."""
+    """Return for each arm its requested runs, its failed runs and its other runs."""
     runs: dict[str, dict[tuple[str, int], Run]] = {}
     failed: dict[str, frozenset[tuple[str, int]]] = {}
     left_out: dict[str, tuple[Path, ...]] = {}
@@ -122,7 +122,7 @@ def _chosen(
 
 
 def probe_rows(run: Run, file: str = PROBES) -> list[dict[str, str]]:
-    """Return the rows of a table of the observer `diagnostics`, or none without the observer."""
+    """Return the table rows of the observer `diagnostics`; none without this observer."""
     path = run.results.folder / file
     if not path.is_file():
         return []
@@ -133,7 +133,7 @@ def probe_rows(run: Run, file: str = PROBES) -> list[dict[str, str]]:
 def probed(
     run: Run, reading: Reading, rows: Sequence[Mapping[str, str]] | None = None
 ) -> float | None:
-    """Return a statistic of a run's gradients, averaged over probes, or None if it is missing."""
+    """Return a statistic of a run's gradients, averaged over probes; None if missing."""
     found = [
         number(row, reading.column)
         for row in (probe_rows(run) if rows is None else rows)
@@ -144,7 +144,7 @@ def probed(
 
 
 def number(row: Mapping[str, str], column: str) -> float | None:
-    """Return a cell as a number, or None if it is empty or not finite."""
+    """Return a cell as a number; None if it is empty or not finite."""
     text = row.get(column, "")
     value = float(text) if text else float("nan")
     return value if isfinite(value) else None

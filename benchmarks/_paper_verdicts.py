@@ -14,11 +14,11 @@ from crossgrad_plugins.compare.quantity import Quantity
 from crossgrad_plugins.compare.run import Run
 from crossgrad_plugins.compare.statistics import Estimate, Verdict, corrected, estimate, verdicts
 
-#: Largest significant p-value. If at least the second value, a share of the pairs, is missing, the
-#: claim stays open.
+#: `_SURE`: a p-value below this number is significant. `_LOST`: a claim stays open if at least
+#: this share of the pairs is missing.
 _SURE, _LOST = 0.05, 0.25
-#: The metric on which the verdicts are based. If the exposure of held-out photos is guessed
-#: wrongly, plain PSNR depends more on this guess than on the scene. Different arms then have
+#: The metric on which verdicts are based. If the exposure of held-out photos is predicted wrongly,
+#: plain PSNR depends more on this prediction than on the scene. Different arms would then have
 #: similar values.
 PSNR = Quantity.of("psnr_cc")
 PLAIN = Quantity.of("psnr")
@@ -40,7 +40,7 @@ class Answer:
 
     Attributes:
         outcome: The verdict.
-        figure: Our value with its interval, or an empty text.
+        figure: Our result with its interval, or an empty text.
         detail: Remarks on the verdict, or an empty text.
     """
 
@@ -51,7 +51,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class _Measured:
-    """A test with its contrast, which is None without runs."""
+    """A test with the contrast of its arms; the contrast is None without runs."""
 
     check: Check
     contrast: Contrast | None
@@ -62,12 +62,12 @@ class _Measured:
 
 @dataclass(frozen=True)
 class Judgement:
-    """The judgement on a comparison, corrected for the other comparisons of its table.
+    """The verdict on a comparison, corrected for the other comparisons of its table.
 
     Attributes:
         verdict: Verdict of `crossgrad compare`.
-        is_small: True if the difference is surely within the margin.
-        is_not_above: True if the difference is surely not above the margin.
+        is_small: True if the interval of the difference is within the margin.
+        is_not_above: True if the interval of the difference is below the margin.
     """
 
     verdict: Verdict = Verdict.INCONCLUSIVE
@@ -76,7 +76,7 @@ class Judgement:
 
 
 def answers(checks: Sequence[Check], results: Results, tables: Tables) -> list[Answer]:
-    """Return the answers to the checks of one table, whose p-values are corrected together."""
+    """Return the answers to the checks of a table; their p-values are corrected together."""
     measured = [_measured(check, results) for check in checks]
     # Two statements about the same two arms count as one comparison.
     family = {_key(each): _estimate(each) for each in measured if _is_judged(each)}
@@ -85,7 +85,7 @@ def answers(checks: Sequence[Check], results: Results, tables: Tables) -> list[A
 
 
 def judgements(family: Sequence[Estimate]) -> list[Judgement]:
-    """Return the judgements on comparisons that are shown together."""
+    """Return the verdicts on comparisons that are shown together."""
     small = corrected([each.p_equivalent for each in family])
     above = corrected([each.p_above for each in family])
     return [
@@ -148,7 +148,7 @@ def paired(
 
 
 def _of_gradients(probe: Probe, results: Results, margin: float) -> Contrast:
-    """Return a statistic of the gradients, or its difference from another statistic, by run."""
+    """Return a statistic of the gradients by run, or its difference from another statistic."""
     pairs = []
     for (scene, seed), run in sorted(results.runs.get(probe.arm, {}).items()):
         if probe.scenes and scene not in probe.scenes:
@@ -167,7 +167,7 @@ def _of_gradients(probe: Probe, results: Results, margin: float) -> Contrast:
 
 
 def figure_of(found: Contrast, *, signed: bool = True) -> str:
-    """Return an estimate with its 95 % interval and number of pairs, or "" without pairs."""
+    """Return an estimate with its 95 % interval and number of pairs; "" without pairs."""
     if found.estimate is None:
         return ""
     quantity, center = found.quantity, found.estimate.center
@@ -183,7 +183,7 @@ def figure_of(found: Contrast, *, signed: bool = True) -> str:
 
 
 def with_plain(pairing: Pairing, results: Results, found: Contrast) -> str:
-    """Return the value, followed by the estimate of plain PSNR."""
+    """Return a result, followed by the estimate of plain PSNR."""
     text = figure_of(found)
     plain = paired(pairing, results, PLAIN)
     if not text or plain.estimate is None:
@@ -226,7 +226,7 @@ def _judged(each: _Measured, judgement: Judgement) -> Answer:
 
 
 def _located(within: tuple[float, float], interval: tuple[float, float]) -> Outcome:
-    """Return the verdict on the claim that a value is within bounds, from its 95 % interval."""
+    """Return the verdict on the claim that a value is within bounds, from the value's interval."""
     low, high = interval
     if within[0] <= low and high <= within[1]:
         return Outcome.HOLDS
@@ -234,14 +234,14 @@ def _located(within: tuple[float, float], interval: tuple[float, float]) -> Outc
 
 
 def outcome_of(expected: Expected, judgement: Judgement, found: Contrast) -> Outcome:
-    """Return the outcome of a statement about two arms, from the judgement on their difference.
+    """Return the verdict on a statement about two arms.
 
-    A statement that holds for all scenes together is open if one scene clearly contradicts it.
+    If one scene clearly contradicts a statement, the verdict on all scenes together is open.
     """
     ahead = found.favours == found.first
     verdict = judgement.verdict
     if verdict is Verdict.INCONCLUSIVE:
-        # A one-sided statement can be decided although the two-sided verdict is open.
+        # A one-sided statement can have a verdict although the two-sided test is inconclusive.
         settled = expected == "not better" and judgement.is_not_above
         return Outcome.HOLDS if settled else Outcome.OPEN
     holds = {
@@ -256,7 +256,7 @@ def outcome_of(expected: Expected, judgement: Judgement, found: Contrast) -> Out
 
 
 def _calculated(claim: Arithmetic, tables: Tables) -> Answer:
-    """Return the answer to a statement about shares of a gap, from the paper's own values."""
+    """Return the answer to a statement about shares of a gap, from the paper's own numbers."""
     method = values(tables, claim.table, claim.method, "PSNR")
     base = values(tables, claim.table, claim.base, "PSNR")
     target = values(tables, claim.target_table, claim.target, "PSNR")

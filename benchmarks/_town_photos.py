@@ -1,9 +1,10 @@
-"""Photos of a town of boxes and trees by ray casting, with colours, shading and shadows.
+"""Photos of a town of boxes and trees, made by ray casting with colours, shading and shadows.
 
-Coordinates are metres, z up. A box is a row x, y, half width, half depth, bottom, top, cosine and
-sine of its rotation, height of its middle, radius of its bounding sphere. A tree is an ellipsoid x,
-y, z, horizontal and vertical radius. Patterns are procedural, with details from 3 cm to several
-metres, so that overviews and close-ups of a wall both contain details to learn.
+Coordinates are in metres, and z points up. A box is a row of ten numbers: x, y, half width, half
+depth, bottom, top, cosine and sine of its rotation, height of its middle, radius of its bounding
+sphere. A tree is an ellipsoid: x, y, z, horizontal and vertical radius. Patterns are procedural and
+have details from 3 cm to several metres. Overviews and close-ups of a wall therefore both contain
+details.
 """
 
 import math
@@ -26,7 +27,7 @@ kernel = njit(error_model="numpy")
 
 @kernel
 def _lot(x: int, y: int, z: int) -> float:
-    """Return a hash of three integers as a number in [0, 1)."""
+    """Return a pseudo-random number in [0, 1), a hash of three integers."""
     h = (x * 374761393 + y * 668265263 + z * 2147483647 + 1013904223) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
     h = ((h ^ (h >> 16)) * 2246822519) & 0xFFFFFFFF
@@ -47,7 +48,7 @@ def _noise(x: float, y: float, k: int) -> float:
 
 @kernel
 def _grain(x: float, y: float, k: int, finest: float) -> float:
-    """Return octaves of noise from 4 m to `finest`, with mean 0."""
+    """Return a sum of noise with periods from 4 m to `finest`, with mean 0."""
     total, frequency, weight = 0.0, 0.25, 0.5
     while frequency * finest <= 1:
         total += weight * (_noise(x * frequency + 17.3 * k, y * frequency + 5.1 * k, k) - 0.5)
@@ -76,7 +77,10 @@ def _window(k: int, column: int, row: int, across: float, up: float) -> Vector:
 
 @kernel
 def _wall(u: float, v: float, k: int) -> Vector:
-    """Return the colour of a wall at u along it and v above the ground, with shops and windows."""
+    """Return the colour of a wall with shops and windows.
+
+    The position is u along the wall and v above the ground.
+    """
     red, green = 0.35 + 0.5 * _lot(k, 1, 7), 0.32 + 0.42 * _lot(k, 2, 7)
     blue = 0.28 + 0.4 * _lot(k, 3, 7)
     tone = 1 + 0.55 * _grain(u, v, k, 0.03)
@@ -117,7 +121,7 @@ def _roof(x: float, y: float, k: int) -> Vector:
 
 @kernel
 def _road(a: float, b: float, along: float, road: float, tone: float) -> Vector:
-    """Return the colour of asphalt. a and b are the distances from the middles of two roads."""
+    """Return the colour of asphalt; a and b are the distances to the middles of two roads."""
     near, far = min(a, b), max(a, b)
     line = near < 0.09 and _part(along, 4.0)[1] < 0.5
     crossing = road / 2 + 0.5 < far < road / 2 + 3 and abs(_part(near, 0.6)[1] - 0.5) < 0.22
@@ -154,7 +158,7 @@ def _sky(way: Vector, k: int) -> Vector:
 
 @kernel
 def _hit_box(eye: Vector, way: Vector, box: Array, best: float) -> tuple[float, int]:
-    """Return distance and face axis of a box if it is nearer than `best`, else `best` and -1."""
+    """Return distance and face of a box if it is nearer than `best`, else `best` and -1."""
     x, y, z = eye[0] - box[0], eye[1] - box[1], eye[2] - box[8]
     along = x * way[0] + y * way[1] + z * way[2]
     if along > box[9] or x * x + y * y + z * z - along * along > box[9] * box[9]:
@@ -165,8 +169,8 @@ def _hit_box(eye: Vector, way: Vector, box: Array, best: float) -> tuple[float, 
     least, most = (-box[2], -box[3], box[4]), (box[2], box[3], box[5])
     entry, exit_, face = _NEAR, best, -1
     for axis in range(3):
-        # If a ray is parallel to a face, this divides by 0. Comparisons with the resulting
-        # infinities are still correct.
+        # A ray parallel to a face divides by 0. Comparisons with the infinite result are still
+        # correct.
         first = (least[axis] - begin[axis]) / ahead[axis]
         second = (most[axis] - begin[axis]) / ahead[axis]
         if min(first, second) > entry:
@@ -199,10 +203,10 @@ def first_hit(
         way: Direction of the ray, a unit vector.
         boxes: [B, 10].
         trees: [T, 5].
-        any_hit: True if any hit is enough.
+        any_hit: True to stop at any object, which need not be the first.
 
     Returns:
-        Distance, kind, index, and the axis of a box's face.
+        Distance, kind and index of the object, and the axis of the hit face of a box.
     """
     best, kind, number, face = FAR, SKY, -1, 0
     if way[2] < 0 and -eye[2] / way[2] < best:
@@ -251,7 +255,7 @@ def _of_tree(at: Vector, tree: Array, k: int) -> tuple[Vector, Vector]:
 def _seen(
     eye: Vector, way: Vector, boxes: Array, trees: Array, sun: Vector, town: Array
 ) -> tuple[float, Vector]:
-    """Return distance (FAR for the sky) and colour of the first hit of a ray."""
+    """Return distance (FAR for the sky) and colour of the first object that a ray hits."""
     seed, pitch, road = int(town[0]), town[1], town[2]
     distance, kind, number, face = first_hit(eye, way, boxes, trees, False)
     if kind == SKY:
@@ -292,11 +296,11 @@ def photograph(
         things: [B, 10] boxes, [T, 5] trees, unit vector towards the sun, and [3] seed of the
             patterns, distance of roads in metres, width of a road.
         size: Width and height.
-        rays: A pixel has `rays` x `rays` rays, and one more ray for the depth.
+        rays: Each pixel averages `rays` x `rays` rays; one more ray gives its depth.
 
     Returns:
-        [height, width, 3] in [0, 1], and [height, width] depth along the camera's axis, 0 for the
-        sky.
+        [height, width, 3] colours in [0, 1], and [height, width] depths along the camera's axis, 0
+        for the sky.
     """
     (eye, axes, focal), (boxes, trees, sun, town), (width, height) = camera, things, size
     image, depth = np.zeros((height, width, 3)), np.zeros((height, width))

@@ -2,7 +2,7 @@
 
     python benchmarks/adam.py [--gaussians N] [--reps N] [--threads N]
 
-The optimizers alternate, so that changes of the machine's load affect all of them.
+The optimizers take turns, so that other work on the machine affects all of them equally.
 """
 
 import argparse
@@ -40,7 +40,7 @@ def ours(params: dict[str, Tensor], grads: dict[str, Tensor]) -> Callable[[], ob
 def theirs(
     params: dict[str, Tensor], grads: dict[str, Tensor], *, fused: bool
 ) -> Callable[[], object]:
-    """Return a step of `torch.optim.Adam`, fused or by foreach operators."""
+    """Return a function that takes a step of `torch.optim.Adam`, fused or foreach."""
     for name, param in params.items():
         param.requires_grad_()
         param.grad = grads[name]

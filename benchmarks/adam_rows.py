@@ -1,10 +1,11 @@
-"""Time an Adam step of the drawn rows, compared with a step of all rows.
+"""Time an Adam step of only the drawn rows, compared with a step of all rows.
 
     python benchmarks/adam_rows.py [--rows N] [--reps N]
 
-Rows are drawn at random in runs of 64, like Gaussians stored in Morton order, with a new choice in
-each step. Deferred updates of these rows are flushed before the step. The table shows both ways by
-the share of drawn rows. `MOST_ROWS` (crossgrad_core/training/adam/late.py) is based on it.
+Rows are drawn in random groups of 64 adjacent rows, because neighbouring Gaussians are adjacent in
+Morton order. Each step has new groups. The deferred updates of these rows are done before the step.
+The table shows both kinds of steps by the share of drawn rows. The constant `MOST_ROWS`
+(crossgrad_core/training/adam/late.py) was chosen with this table.
 """
 
 import argparse
@@ -22,13 +23,12 @@ from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.training.adam import late
 from crossgrad_core.training.adam.adam import counted
 
-#: Number of adjacent rows in a group, number of selections that alternate, and shares of the rows
-#: that are rendered.
+#: Number of adjacent rows in a group, number of different selections, and shares of drawn rows.
 RUN, CHOICES, SHARES = 64, 8, (0.1, 0.2, 0.3, 0.5, 0.7)
 
 
 def milliseconds(count: int, share: float, most: float, reps: int) -> float:
-    """Return the median milliseconds of a step including the flush, for [count, 15, 3] elements."""
+    """Return the median milliseconds of a step with its deferred updates."""
     late.MOST_ROWS = most  # type: ignore[misc] - both ways are measured
     rng = np.random.default_rng(0)
     param, state, rows_late = torch.randn(count, 15, 3), AdamState(), late.Late()

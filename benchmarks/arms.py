@@ -25,7 +25,7 @@ from crossgrad_plugins.compare.quantity import Quantity
 from crossgrad_plugins.compare.run import Run
 
 PSNR = Quantity.of("psnr")
-#: Row of the table -> names of its regimes in the scenes. None stands for all views.
+#: Title of a row -> names of its regimes in the scenes. None stands for all views.
 REGIMES = {"overall": (None,), "far": ("far", "aerial"), "near": ("near", "street")}
 #: Key of summary.json -> title of the column.
 NUMBERS = {"step": "steps", "views": "views", "primitives": "Gaussians", "cpu_seconds": "CPU s"}
@@ -33,13 +33,16 @@ NUMBERS = {"step": "steps", "views": "views", "primitives": "Gaussians", "cpu_se
 
 @dataclass(frozen=True)
 class Runs:
-    """Runs by arm, scene and seed. An arm with several lengths is split into one arm per length."""
+    """Runs by arm, scene and seed.
+
+    If an arm has runs of several lengths, each length becomes a separate arm.
+    """
 
     by_arm: dict[str, dict[tuple[str, int], Run]]
 
     @classmethod
     def read(cls, places: Sequence[Path]) -> "Runs":
-        """Read all finished runs at or below the places, without runs of a sweep's earlier grids.
+        """Read all finished runs in or below the folders, without runs of earlier grids.
 
         Raises:
             UserError: There are no runs, a file is damaged, runs of one scene differ in views or
@@ -84,7 +87,8 @@ def arms(runs: Runs, figures: Sequence[str] = (PSNR.name,)) -> Iterator[str]:
 
     Args:
         runs: The runs.
-        figures: Metrics that are shown. The first metric is also shown for each regime.
+        figures: Names of the metrics that are shown. The first metric is also shown for each
+            regime.
     """
     regimes = [name for name in REGIMES if name != "overall"]
     titles = ("scene", "arm", "rates", "seeds", *figures[:1], *regimes, *figures[1:])
@@ -97,7 +101,7 @@ def arms(runs: Runs, figures: Sequence[str] = (PSNR.name,)) -> Iterator[str]:
 
 
 def against(runs: Runs, baseline: str) -> Iterator[str]:
-    """Yield the table of differences from an arm, overall and by regime, with verdicts."""
+    """Yield the table of differences from one arm, overall and by regime, with verdicts."""
     yield from head("arm", *(f"{each}, less {baseline}" for each in REGIMES))
     others = [arm for arm in runs.by_arm if arm != baseline]
     table = [runs.difference(arm, baseline, regime) for arm in others for regime in REGIMES]
@@ -122,7 +126,7 @@ def head(*titles: str) -> Iterator[str]:
 
 
 def figure(run: Run, regime: str, name: str = PSNR.name) -> float | None:
-    """Return a run's final value in a regime of `REGIMES`, or None if it is missing."""
+    """Return a run's final metric in a regime of `REGIMES`; None if it is missing."""
     found = (run.final(name, each) for each in REGIMES[regime])
     return next((value for value in found if value is not None), None)
 
@@ -174,7 +178,7 @@ def main() -> None:
 
 
 def read(places: Sequence[Path]) -> Runs:
-    """Return the runs at or below the places. An error ends the program with one message."""
+    """Return the runs in or below the folders. An error ends the program with one message."""
     try:
         return Runs.read(places)
     except UserError as error:

@@ -2,10 +2,10 @@
 
     python benchmarks/backbone_cost.py SCENE [--max-size 400] [--steps 400] [--reps 40]
 
-Each backbone is trained for --steps steps. Then the backbone and a vanilla model take alternate
-steps on one view. The vanilla model contains the Gaussians that the backbone draws for this view.
-Both draw the same number of Gaussians, and the ratio is taken pairwise, step by step. The first row
-compares vanilla with itself.
+Each backbone is first trained for --steps steps. Then the backbone and a vanilla model take
+alternate steps on one view. The vanilla model consists of the Gaussians that the backbone decodes
+for this view. Backbone and vanilla model therefore draw the same number of Gaussians. The ratio of
+times is computed for each pair of steps. The first row compares vanilla with itself.
 """
 
 import argparse
@@ -29,8 +29,7 @@ from crossgrad_core.training.start import first_state, warm_up
 from crossgrad_core.training.state import TrainState
 
 BACKBONES = ("vanilla", "pixel", "mip", "analytic", "distance", "scaffold", "octree")
-#: A step of the published schedule in which all SH bands are trained. It is far enough from the
-#: next edit.
+#: A step of the published schedule at which all SH bands are trained. No edit is near this step.
 START = 5001
 REPS_BETWEEN_EDITS = 90
 
@@ -46,10 +45,10 @@ def trained(scene: Scene, config: RunConfig, steps: int) -> tuple[Setup, TrainSt
 
 
 def on_one_view(setup: Setup, state: TrainState) -> Setup:
-    """Return the run restricted to its first training view, in the middle of the schedule."""
+    """Return the run with only its first training view, in the middle of the schedule."""
     scene = replace(setup.scene, train=setup.scene.train[:1])
     state.step = START
-    # Remove the state of the sampler, because it contains an order of all views.
+    # Remove the state of the sampler, because it refers to all views.
     state.states.pop("sampler", None)
     return replace(setup, scene=scene)
 

@@ -2,12 +2,12 @@
 
     python benchmarks/busy.py CASE.npz [--rounds N] [--reps N] [--threads N]
 
-Idle OpenMP threads spin for a while. Spinning is fastest if no other program runs. Otherwise it
-takes the core from a process that needs it: another program, or even the thread for which the
-spinning threads wait. Each round measures every policy, without other programs and with one
-computing program per core. The table shows medians over the rounds in ms. It also shows the time of
-one process with one thread, without and with a second such process, because "two cores" may be one
-physical core.
+Idle OpenMP threads wait in a loop for a while. This is fastest if no other program runs. Otherwise
+the loop occupies a core that another program needs, or that the thread needs for which the loop
+waits. Each round measures every policy twice: without other programs, and with one computing
+program per core. The table shows medians over the rounds in ms. For comparison, the table also
+shows a process with one thread, alone and together with a second such process. The reason is that
+"two cores" may be one physical core.
 """
 
 import argparse
@@ -24,9 +24,9 @@ from statistics import median
 from _machine import code, facts
 
 STEP = Path(__file__).with_name("step.py")
-#: Name -> environment of a process.
+#: Name of a policy -> environment variables of the process.
 WAYS = {
-    "crossgrad": {"OMP_WAIT_POLICY": "PASSIVE"},  # as the command sets it
+    "crossgrad": {"OMP_WAIT_POLICY": "PASSIVE"},  # as crossgrad sets it
     "OpenMP's own": {},
     "spin 1,000": {"GOMP_SPINCOUNT": "1000"},
     "spin 10,000": {"GOMP_SPINCOUNT": "10000"},
@@ -38,7 +38,7 @@ BUSY = "while True: pass"
 
 @contextmanager
 def beside(programs: int) -> Iterator[None]:
-    """Run this number of computing programs while the block runs."""
+    """Run this number of computing programs during the `with` block."""
     others = [subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(programs)]
     try:
         yield

@@ -3,12 +3,12 @@
     python benchmarks/distances.py runs/sweeps/GRID --of city_hybrid --on city_unimodal \
         --folders ladder mid --bands 4 --baseline ARM
 
-The finished runs of one scene are evaluated on the views of another capture of the same place. They
-were not trained on these views. The evaluation is that of `crossgrad eval RUN --on SCENE [--ply
-FILE]`. Finished evaluations are skipped: next to each table, a file records the scene, the step and
-the PLY. The views of each folder are sorted into bands of distance by the size of a pixel on the
-visible surface, so that a table goes from near to far. The table shows the number of measured views
-in brackets. Only runs that kept their checkpoints can be evaluated.
+The finished runs of one scene are evaluated on the views of another capture of the same place. The
+runs were not trained on these views. Runs are evaluated as by `crossgrad eval RUN --on SCENE [--ply
+FILE]`. Finished evaluations are not repeated. A file beside each table records the scene, the step
+and the PLY. The views of each folder are sorted into bands by the size of a pixel on the visible
+surface, so that the table goes from near to far. Brackets in the table contain the number of
+measured views. Only runs whose checkpoints exist can be evaluated.
 """
 
 import argparse
@@ -32,13 +32,13 @@ from crossgrad_plugins.compare.run import Run
 
 @dataclass(frozen=True)
 class Band:
-    """A band: views of one folder at similar distances.
+    """Views of one folder at similar distances.
 
     Attributes:
         folder: The regime of the views.
         names: Names of the photos.
-        low: The smallest size of a pixel on the visible surface, in units of the scene.
-        high: The largest such size.
+        low: Smallest size of a pixel on the visible surface in this band, in units of the scene.
+        high: Largest size of a pixel on the visible surface in this band, in units of the scene.
     """
 
     folder: str
@@ -48,7 +48,7 @@ class Band:
 
 
 def bands_of(capture: Capture, folders: Sequence[str], count: int) -> list[Band]:
-    """Return each folder's views in `count` bands with equal numbers of views, near bands first."""
+    """Return the views of each folder in `count` bands of equal size, near bands first."""
     found = capture.scene
     unit = found.similarity.scale
     bands = []
@@ -64,13 +64,13 @@ def bands_of(capture: Capture, folders: Sequence[str], count: int) -> list[Band]
 
 @dataclass(frozen=True)
 class Probes:
-    """Metric values of runs on views of another capture.
+    """Metrics of runs on views of another capture.
 
     Attributes:
         runs: Arm -> scene and seed -> run.
         values: Folder of a run -> photo -> metric.
         bands: The bands of views.
-        quantity: The quantity of the figures.
+        quantity: The metric.
     """
 
     runs: Mapping[str, Mapping[tuple[str, int], Run]]
@@ -79,7 +79,7 @@ class Probes:
     quantity: Quantity
 
     def mean(self, run: Run, band: Band) -> float | None:
-        """Return the mean over the measured views of a band, or None without such views."""
+        """Return the mean over the measured views of a band; None without views."""
         found = self._measured(run, band)
         return fmean(found) if found else None
 
@@ -88,7 +88,7 @@ class Probes:
         return [known[name] for name in sorted(band.names) if name in known]
 
     def title(self, band: Band) -> str:
-        """Return a band's folder, range of pixel sizes, and range of measured views per run."""
+        """Return a band's folder, its range of pixel sizes, and its numbers of measured views."""
         runs = [run for own in self.runs.values() for run in own.values()]
         counts = sorted({len(self._measured(run, band)) for run in runs})
         views = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
@@ -108,7 +108,7 @@ class Probes:
         return f"{fmean(means):.2f}" + (f" ± {stdev(means):.2f}" if len(means) > 1 else "")
 
     def against(self, baseline: str) -> Iterator[str]:
-        """Yield the table of differences from an arm, with their verdicts."""
+        """Yield the table of differences from one arm, with verdicts."""
         others = [arm for arm in self.runs if arm != baseline]
         table = judged(
             contrast(
@@ -131,7 +131,10 @@ class Probes:
 def figures_of(
     runs: Sequence[Run], capture: Capture, name: str, *, file: bool
 ) -> dict[Path, dict[str, float]]:
-    """Return folder of a run -> photo -> metric of its model, or of its PLY drawn on black.
+    """Return the metric of each run on each photo of the capture.
+
+    The outer keys are the folders of the runs. The inner keys are the names of the photos. If
+    `file` is True, the PLY of the run is rendered on black, else the model of the run.
 
     Raises:
         UserError: The metric does not exist, or a run cannot be evaluated.

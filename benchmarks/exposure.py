@@ -1,9 +1,9 @@
-"""Measure differences in exposure between photos from SfM tracks, for docs/exposure.md.
+"""Measure differences in exposure between the photos of a scene, for docs/exposure.md.
 
     python benchmarks/exposure.py SCENE [SCENE ...]
 
-All photos of a scene are used in full size, including held-out photos. Seconds are CPU seconds of
-the process, without reading the scene and decoding its photos.
+All photos of a scene are used at full size, including held-out photos. Seconds are CPU seconds of
+the process; reading the scene and decoding photos do not count.
 """
 
 import argparse
@@ -21,7 +21,10 @@ HEADER = (
 
 
 def row(name: str, with_exif: int, gains: TrackGains, seconds: float) -> str:
-    """Return the line of a scene. `with_exif` photos have an exposure in EXIF."""
+    """Return the table line of a scene.
+
+    `with_exif` is the number of photos that have an exposure in EXIF.
+    """
     known = gains.gains[gains.known]
     ends = f"{known.min():+.2f} .. {known.max():+.2f}" if len(known) else "-"
     auto = "gain" if gains.differ else "none"

@@ -3,8 +3,8 @@
     python benchmarks/extremes.py [BACKBONE ...] [--crowd 20000]
 
 The image error is the largest difference in a channel of a pixel. The gradient error is the largest
-relative L2 error of a parameter tensor. Both compare the `numba` rasterizer in float32 with `torch`
-in float64.
+relative L2 error of a parameter tensor. Both errors compare rasterizer `numba` in float32 with
+rasterizer `torch` in float64.
 """
 
 import argparse
@@ -22,7 +22,7 @@ from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer
 
 
 def cell(backbone: Backbone, case: str, crowd: int) -> str:
-    """Return image and gradient error of one case."""
+    """Return the image error and the gradient error of a case."""
     extreme = cases(crowd)[case](jittered(backbone), sample_camera())
     exact = outcome(backbone, TorchRasterizer(), extreme, torch.float64)
     found = outcome(backbone, NumbaRasterizer(), extreme, torch.float32)

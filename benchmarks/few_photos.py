@@ -1,10 +1,10 @@
-"""Make scenes with few training photos by leaving out training photos of a scene.
+"""Make scenes with few training photos from a scene with many.
 
     python benchmarks/few_photos.py OUT --photos 8 14 --draw 1 SCENES/ochota_kap_hybrid_gain ...
     crossgrad sweep benchmarks/grids/few_photos.yaml --threads 1 --scene OUT/... --scene SCENE
 
-The program makes OUT/SCENE-8 and so on. Each folder contains links to photos and cameras, a list of
-training photos drawn at random, and a list of the scene's held-out photos. The program prints the
+The program makes folders such as OUT/SCENE-8. Each folder contains links to photos and cameras, a
+random list of training photos, and the scene's list of held-out photos. The program prints the
 median number of training photos in which a point is visible.
 """
 

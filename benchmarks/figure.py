@@ -1,4 +1,4 @@
-"""Compose the picture of the README: two panels of a run above each other, its curve on the right.
+"""Compose the picture of the README: two panels of a run on the left, its curve on the right.
 
 python benchmarks/figure.py RUN docs/images/boruszyn.png
 """

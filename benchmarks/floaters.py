@@ -1,9 +1,9 @@
-"""Print a table of held-out photos of finished runs, with and without floaters.
+"""Print a table of held-out photos of finished runs, before and after removal of floaters.
 
     crossgrad run SCENE --seconds 600 --no-rule floaters --out RUN
     python benchmarks/floaters.py RUN ...
 
-A run that already removed its floaters has no floaters left. The runs are not changed.
+The runs must still contain their floaters. The runs are not changed.
 """
 
 import argparse
@@ -39,7 +39,7 @@ def measured(setup: Setup, state: TrainState) -> EvaluationResult:
 
 
 def row(folder: Path, empty: float) -> Sequence[str]:
-    """Return a run's line: removed primitives, duration, and changes of held-out photos."""
+    """Return a run's line: number of removed primitives, time, and changes of held-out photos."""
     setup, state = opened(folder, {})
     setup = setup.with_rules({"floaters": Floaters.model_construct(empty=empty)})
     primitives = state.primitives(setup)
@@ -47,7 +47,8 @@ def row(folder: Path, empty: float) -> Sequence[str]:
         eval_parameters(setup, state)[setup.backbone.positions].detach().double().cpu().numpy()
     )
     near = int(in_empty_space(positions.double().cpu().numpy(), setup.scene, empty).sum())
-    before = measured(setup, state)  # This call also compiles the code that is timed below.
+    # This first call also compiles the code, so that the time below does not contain compilation.
+    before = measured(setup, state)
     start = perf_counter()
     list(final_edits(setup, state))
     seconds = perf_counter() - start

@@ -1,19 +1,22 @@
-"""Measure step times, memory and quality on a GPU. Finished measurements are kept.
+"""Measure step times, memory and quality on a GPU.
+
+Finished measurements are stored and not repeated.
 
     python benchmarks/gpu.py SCENE                                 # all of it
     python benchmarks/gpu.py SCENE --gsplat-examples gsplat/examples
     python benchmarks/gpu.py SCENE --only sizes-gsplat steps-gsplat
 
-`sizes` takes steps on a random cloud of Gaussians, all of them visible, in photos of one megapixel.
+Part `sizes` takes steps on a random cloud of visible Gaussians, with photos of one megapixel. Part
 `steps` takes steps on SCENE with every rasterizer that runs on the GPU, every backbone, K and
-operator. Both measure steps during density control, between two edits, with SH degree 3, in this
-process. Seconds are wall time from an idle GPU to an idle GPU. `long` trains SCENE for 30,000 steps
-with the published settings, in separate processes. Its rows are the states after 7,000, 15,000 and
-all steps. `usual` trains SCENE with the default settings of `crossgrad run`, for several lengths.
-With the folder of gsplat's examples, gsplat's own trainer takes as many steps as `long` on the same
-scene. It holds out each 8th photo, and our runs hold out each 8th photo of each folder. Runs,
-gpu.csv, the curves of runs (gpu_curves.csv) and gpu.md are in the folder of `--out`. After an
-interruption, the same command continues. Without a GPU the exit code is 2.
+operator. Both parts measure steps during density control and between two edits, with SH degree 3,
+in this process. Seconds are wall time; the GPU is idle at the start and at the end of a
+measurement. Part `long` trains SCENE for 30,000 steps with the published settings, in separate
+processes. Its table rows show the run after 7,000, 15,000 and all steps. Part `usual` trains SCENE
+with the default settings of `crossgrad run`, for several lengths. If the folder of gsplat's
+examples is given, gsplat's own trainer also trains SCENE for as many steps as `long`. gsplat's
+trainer holds out every 8th photo of the scene, and crossgrad holds out every 8th photo of each
+folder. Runs and tables (gpu.csv, gpu_curves.csv, gpu.md) are written to the folder of `--out`.
+After an interruption, the same command continues. Without a GPU the exit code is 2.
 """
 
 import argparse
@@ -57,13 +60,13 @@ Row = dict[str, Any]
 
 
 class Short:
-    """Measures cases in this process, and stores the measurements in a file.
+    """Measures cases in this process, and stores the results in a file.
 
     Args:
-        scene: SCENE.
+        scene: Path of SCENE.
         kept: The file, with one JSON line per case.
-        place: Scene, GPU and commit of the measurements. Figures of another scene, GPU or commit
-            are not used.
+        place: Scene, GPU and commit of the measurements; stored results with other values are
+            ignored.
     """
 
     def __init__(self, scene: Path, kept: Path, place: str) -> None:
@@ -76,17 +79,17 @@ class Short:
                 self._known[row.pop("case")] = row
 
     def known(self, case: Case) -> Row | None:
-        """Return the stored measurements of a case, or None."""
+        """Return the stored results of a case, or None."""
         return self._known.get(self._key(case))
 
     def row(self, case: Case) -> Row:
-        """Return the measurements of a case, or the reason of a failure, which is not stored."""
+        """Return the results of a case, or the reason of a failure; failures are not stored."""
         if (known := self.known(case)) is not None:
             return known
         try:
             found = self._measured(case)
         except Exception as error:
-            # A failed case must not end the table, unless the GPU can no longer be used.
+            # A failed case must not end the program, unless the GPU cannot be used any more.
             torch.cuda.synchronize()
             return _row(case, {"note": " ".join(f"{type(error).__name__}: {error}".split())})
         row = _row(case, found)
@@ -103,7 +106,8 @@ class Short:
         before = torch.cuda.memory_allocated()
         setup, state = self._begun(case)
         setup.rasterizer.self_test("cuda")
-        guard = RollbackGuard(state)  # Keep a copy of the state for a rollback, as a run does.
+        # Keep a copy of parameters and moments for a rollback, as a run does.
+        guard = RollbackGuard(state)
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
         seconds = steady(setup, state, case.steps)
@@ -136,7 +140,7 @@ class Short:
 
 
 def steady(setup: "Setup", state: "TrainState", steps: int) -> float:
-    """Return the seconds of `steps` steps after all photos and kernels are loaded."""
+    """Return the seconds of `steps` steps, after all photos and kernels are loaded."""
     for index in range(len(setup.train_views)):
         target_at(setup, state, index, 1.0)
     for _ in range(max(3, steps // 6)):
@@ -158,7 +162,10 @@ def finished(folder: Path) -> Path | None:
 
 
 def measured(case: Case, scene: Path, out: Path) -> tuple[Path | None, str]:
-    """Train the case's run if it is missing. Return its folder, or None and the reason."""
+    """Train the case's run if it is missing.
+
+    Return the folder of the run and an empty text. If training failed, return None and the reason.
+    """
     folder = out / "runs" / case.name
     if (run := finished(folder)) is not None:
         return run, ""
@@ -171,8 +178,8 @@ def measured(case: Case, scene: Path, out: Path) -> tuple[Path | None, str]:
         return place, ""
     why = " ".join(ended.stderr.split())
     if ended.returncode == 2:
-        # Store the reason of invalid input, because invalid input stays invalid. The next command
-        # tries other failures again.
+        # Store the reason if the input is invalid, because a repetition would fail again. Other
+        # failures are tried again by the next command.
         folder.mkdir(parents=True, exist_ok=True)
         refused.write_text(why, encoding="utf-8")
     return None, why
@@ -185,7 +192,7 @@ def _row(case: Case, found: Row) -> Row:
 
 
 def rows_of(case: Case, run: Path | None, why: str) -> Iterator[Row]:
-    """Yield the measurements of a long run at its stops, or the reason why they are missing."""
+    """Yield the results of a long run at its stops, or the reason why they are missing."""
     if run is None:
         yield _row(case, {"note": why})
         return
@@ -239,7 +246,7 @@ def theirs(
 
 
 def curve_rows(case: Case, run: Path | None) -> Iterator[Row]:
-    """Yield step, training seconds and PSNR of every evaluation of an existing long run."""
+    """Yield step, training seconds and PSNR of every evaluation of a long run."""
     for row in [] if run is None else read_run(run).rows:
         shown = {name: row.get(name) for name in ("step", "train_seconds", "psnr")}
         yield {"run": case.name, **shown}
@@ -278,7 +285,7 @@ def _rounded(value: float | None) -> float | str:
 
 
 def case_rows(case: Case, short: Short, out: Path, *, new: bool) -> tuple[list[Row], list[Row]]:
-    """Return the rows of a case and of its curve, or none if it is neither new nor measured."""
+    """Return the table rows of a case and of its curve; none if it was not measured."""
     if case.part not in {"long", "usual"}:
         row = short.row(case) if new else short.known(case)
         return ([] if row is None else [row]), []
@@ -289,7 +296,7 @@ def case_rows(case: Case, short: Short, out: Path, *, new: bool) -> tuple[list[R
 
 
 def run_all(arguments: argparse.Namespace, gpu: str) -> None:
-    """Measure missing cases, and write the tables after every case."""
+    """Measure the missing cases, and write the tables after every case."""
     out, scene = arguments.out.resolve(), arguments.scene.resolve()
     out.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []

@@ -2,9 +2,9 @@
 
     python benchmarks/interval_coverage.py [repetitions] [noise ...]
 
-Prints the share of repetitions in which an interval contains the true value (nominally 95 %), by
-kind of noise, dimension of the gradients, number of near and far views, and true ratio
-sigma_b^2 / sigma_w^2.
+The program prints the share of repetitions in which an interval contains the true value (nominally
+95 %). The rows differ by kind of noise, dimension of the gradients, number of near and far views,
+and true ratio sigma_b^2 / sigma_w^2.
 
 `normal`: independent normal components; `decaying`: standard deviations decrease like 1/sqrt(k), so
 that few directions dominate; `student3`: independent components of Student's t with 3 degrees of

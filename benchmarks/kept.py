@@ -1,11 +1,11 @@
-"""Pack the tables of a sweep into one small file, or unpack this file.
+"""Pack the tables of a sweep into one small file, or unpack such a file.
 
     python benchmarks/kept.py pack runs/sweeps/GRID benchmarks/results/GRID.tar.xz
     python benchmarks/kept.py unpack benchmarks/results/GRID.tar.xz runs/sweeps/GRID
 
-The file contains configurations, summaries, evaluations and held-out views of finished runs, but no
-models and pictures. `crossgrad compare` reads the unpacked runs, and `crossgrad sweep` continues
-with the missing runs, also on another machine. The same sweep always gives the same file.
+The file contains configurations, summaries, evaluations and held-out metrics of finished runs, but
+no models and no pictures. `crossgrad compare` can read the unpacked runs. `crossgrad sweep`
+continues with the missing runs, also on another machine. Packing a sweep twice gives equal files.
 """
 
 import argparse
@@ -20,13 +20,13 @@ from typing import TypeAlias
 from crossgrad_core.commands import UserError, read_rows, summary_of, write_atomically
 from crossgrad_core.system.text_files import csv_bytes
 
-#: The table of a sweep. It assigns each run to a configuration.
+#: The table of a sweep. The table assigns a configuration to each run.
 TABLE = "runs.csv"
-#: Rows of this table, of which the first row is the header.
+#: Rows of this table; the first row is the header.
 Rows: TypeAlias = Sequence[Sequence[str]]
 
-#: Files of a run that are packed. The observer `diagnostics` writes the files in the second line,
-#: and distances.py writes the files in the last line.
+#: Files of a run that are packed. The second line lists files of the observer `diagnostics`, and
+#: the last line lists files of distances.py.
 FILES = (
     *("config.yaml", "summary.json", "metrics.csv", "per_view.csv", "scene.json"),
     *("diagnostics.csv", "cameras.csv", "groupings.csv"),
@@ -68,7 +68,7 @@ def pack(sweep: Path, archive: Path) -> int:
 
 
 def _check_labelled(sweep: Path, runs: Iterable[str]) -> None:
-    """Refuse runs without a row, because their configuration would be lost with the folder."""
+    """Refuse runs without a row in the table, because their configuration would be lost."""
     known = {row[0] for row in _table(sweep) if row}
     if without := [run for run in runs if run not in known]:
         raise UserError(
@@ -90,8 +90,8 @@ def _is_finished(run: Path) -> bool:
 
 def _kept(sweep: Path, runs: list[Path]) -> Iterator[Path]:
     yield sweep / TABLE
-    # Group the files by name. Similar files then follow each other and are compressed to a third of
-    # the size.
+    # Sort the files by name. Similar files are then adjacent, so that they are compressed to a
+    # third of the size.
     for name in FILES:
         yield from (path for run in runs for path in sorted(run.glob(name)))
 
@@ -106,7 +106,7 @@ def _without_owner(entry: tarfile.TarInfo) -> tarfile.TarInfo:
 def unpack(archive: Path, sweep: Path) -> int:
     """Add the packed runs to the folder of a sweep. Existing runs are not changed.
 
-    New rows are appended to the table of the sweep, including rows of existing runs.
+    New rows are appended to the table of the sweep, even if the run itself already exists.
 
     Returns:
         The number of added runs.
@@ -127,13 +127,13 @@ def unpack(archive: Path, sweep: Path) -> int:
 
 
 def _rows_of(file: tarfile.TarFile) -> Rows:
-    """Return the table of the runs in a file, or no rows if it has no table."""
+    """Return the table of runs in a file; no rows if the file has no table."""
     content = file.extractfile(TABLE) if TABLE in file.getnames() else None
     return [] if content is None else list(csv.reader(io.TextIOWrapper(content, "utf-8")))
 
 
 def _merged(sweep: Path, rows: Rows, runs: Container[str]) -> Rows | None:
-    """Return the table of a sweep with the rows of these runs, or None if it does not change."""
+    """Return a sweep's table with further rows; None if it does not change."""
     own = _table(sweep) if (sweep / TABLE).exists() else []
     if not own or not rows:
         return rows or None

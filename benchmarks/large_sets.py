@@ -3,18 +3,18 @@
     python benchmarks/large_sets.py [--photos 2000] [--max-size 1600] [--passes 2] [--block 25]
         [--distorted] [--warm] [--folder DIR]
 
-The scene is made from the bundled scene: its 28 photos are enlarged tenfold to 4000 x 2980 pixels,
-with grain, saved as JPEG and linked under the requested number of names. Each name also gets a
-camera. crossgrad treats every name as a separate photo, in memory and on disk. Two processes take
-the same steps (`--sampler epoch`, one view, no density control) in turns of `--block` steps. While
+The scene is made from the bundled scene. Its 28 photos are enlarged tenfold to 4000 x 2980 pixels,
+get noise, and are saved as JPEG. Links give the requested number of names. Each name also gets a
+camera, and crossgrad treats every name as a separate photo. Two processes take the same steps
+(`--sampler epoch`, one view, no density control) in alternating blocks of `--block` steps. While
 one process works, the other process is stopped. The first process trains on all photos. The second
-process trains on only the 28 photos, which are in its memory before it begins. Both measure wall
-time, including decoding.
+process trains on only the 28 photos, which are decoded before it begins. Both processes measure
+wall time, including decoding.
 
-The program prints the seconds to the first step, the seconds per step in each pass over the photos,
-and resident memory. It also prints the ratio of seconds to the other process in the same turns.
-`--distorted` uses a camera with lens distortion. `--warm` starts with the photos that an earlier
-run of the same `--folder` left on disk.
+The program prints the seconds until the first step, the seconds per step in each pass over the
+photos, and the resident memory. It also prints the ratio of the seconds of the two processes in the
+same blocks. `--distorted` uses a camera with lens distortion. `--warm` starts with the decoded
+photos that an earlier run with the same `--folder` stored on disk.
 """
 
 import argparse
@@ -34,7 +34,7 @@ from _machine import code, facts
 
 #: Factor by which the bundled photos are enlarged.
 SCALE = 10
-#: Standard deviation of the grain in grey levels, and JPEG quality. With these values, a file has
+#: Standard deviation of the noise in grey levels, and JPEG quality. With these values, a file has
 #: about 4 MB.
 GRAIN, QUALITY = 4.0, 92
 BUNDLED = Path(__file__).parents[1] / "examples" / "scenes" / "boruszyn"
@@ -130,7 +130,7 @@ def _resident(what: str) -> float:
 
 
 class Trainer:
-    """A process that trains on request, and is stopped in between."""
+    """A process that trains when it is asked to, and is stopped otherwise."""
 
     def __init__(self, scene: Path, max_size: int, cache_mib: int, store: Path) -> None:
         command = [sys.executable, __file__, "--serve", str(scene), str(max_size), str(cache_mib)]
@@ -194,7 +194,7 @@ def measure(arguments: argparse.Namespace, folder: Path) -> list[dict[str, Any]]
 def row_of(
     number: int, turns: list[tuple[int, dict[str, float], dict[str, float]]]
 ) -> dict[str, Any]:
-    """Return sums and medians over the turns of one pass."""
+    """Return sums and medians over the blocks of one pass."""
     steps = sum(count for count, _, _ in turns)
     ours, theirs = (sum(turn[who]["seconds"] for turn in turns) for who in (1, 2))
     third = max(1, len(turns) // 3)

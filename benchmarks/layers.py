@@ -2,7 +2,7 @@
 
     python benchmarks/layers.py [--png FILE]
 
-The imports are read from the sources. An arrow is omitted if a longer path has the same ends.
+The imports are read from the sources. An arrow is omitted if a longer path connects its two ends.
 """
 
 import argparse
@@ -21,7 +21,7 @@ WIDTH, HEIGHT = 11.0, 9.0
 
 
 def package_of(module: str) -> str | None:
-    """Return the package of one of our modules, or None for other modules."""
+    """Return the package of one of crossgrad's modules; None for other modules."""
     package, _, rest = f"{module}.__init__".partition(".")
     if package == CORE:
         return rest.split(".")[0]
@@ -53,7 +53,7 @@ def packages() -> dict[str, set[str]]:
 
 
 def direct(graph: Mapping[str, set[str]]) -> dict[str, set[str]]:
-    """Return the graph without arrows that a longer path makes redundant."""
+    """Return the graph without arrows that are implied by longer paths."""
     reached: dict[str, set[str]] = {}
 
     def all_from(package: str) -> set[str]:
@@ -68,7 +68,7 @@ def direct(graph: Mapping[str, set[str]]) -> dict[str, set[str]]:
 
 
 def layers(graph: Mapping[str, set[str]]) -> dict[str, int]:
-    """Return the layer of each package: one above the highest layer that the package imports."""
+    """Return the layer of each package: one above the highest layer that it imports from."""
     found: dict[str, int] = {}
 
     def layer(package: str) -> int:

@@ -1,13 +1,14 @@
-"""Make the case file that is used to time and check rasterizers.
+"""Make the case file with which rasterizers are timed and checked.
 
     python benchmarks/make_case.py CASE.npz --garden test_garden.npz
     python benchmarks/make_case.py CASE.npz
 
-With --garden, the result is the case of docs/benchmarks.md. It uses positions, colours and the
-first camera of a photo set of a garden, which gsplat ships for its tests (file
-assets/test_garden.npz of the public repository nerfstudio-project/gsplat, Apache-2.0; from Mip-NeRF
-360), with random sizes, rotations and opacities. Without --garden, positions and colours are
-random. This case has the same kind and size of data and needs no download, but gives other figures.
+With --garden, the result is the case of docs/benchmarks.md. This case uses positions, colours and
+the first camera of the garden scene of Mip-NeRF 360, with random sizes, rotations and opacities.
+gsplat contains these data for its tests (file assets/test_garden.npz of the public repository
+nerfstudio-project/gsplat, Apache-2.0). Without --garden, positions and colours are random. This
+case has data of the same kind and size and needs no download, but its times and errors are
+different.
 """
 
 import argparse
@@ -28,7 +29,7 @@ SEED = 42
 
 
 def garden(path: Path) -> Arrays:
-    """Return points, colours and first camera of gsplat's test data, within [-2, 2] per axis."""
+    """Return points, colours and first camera of gsplat's data, within [-2, 2] on every axis."""
     with np.load(path) as archive:
         means = archive["means3d"].astype(np.float32)
         inside = (np.abs(means) <= 2.0).all(axis=1)
@@ -43,7 +44,7 @@ def garden(path: Path) -> Arrays:
 
 
 def made_up(gaussians: int) -> Arrays:
-    """Return a table on a lawn: 2/3 of the points on a plane, 1/3 in a ball, seen obliquely."""
+    """Return a synthetic table on a lawn: 2/3 of the points on a plane, 1/3 in a ball."""
     rng = np.random.default_rng(SEED)
     ball = gaussians // 3
     lawn = np.column_stack([rng.uniform(-2, 2, (gaussians - ball, 2)), np.zeros(gaussians - ball)])
@@ -61,7 +62,7 @@ def made_up(gaussians: int) -> Arrays:
 
 
 def oblique_camera() -> NDArray[np.float32]:
-    """Return the pose [4, 4], world to camera: 2.6 units away, 35 degrees above the plane."""
+    """Return the pose [4, 4], world to camera, at distance 2.6 and 35 degrees above the plane."""
     angle = np.deg2rad(35.0)
     down, forward = np.sin(angle), np.cos(angle)
     pose = np.eye(4, dtype=np.float32)

@@ -1,10 +1,10 @@
-"""Compare the frame and the PSNR of a COLMAP scene before and after a move to map coordinates.
+"""Compare frame and PSNR of a COLMAP scene before and after a move to map coordinates.
 
     python benchmarks/moved_scene.py SCENE --steps 600 --max-size 100
 
-The scene is trained in place and moved. It is also trained in place from initial positions that
-differ at random by one unit in the last place of float32. The PSNR of the moved run should be
-within the spread of these runs.
+The scene is trained at its position and at a distant position. For comparison, it is also trained
+at its position with initial positions that are changed at random by one unit in the last place of
+float32. The PSNR of the moved scene should be within the range of the PSNR of these runs.
 """
 
 import argparse
@@ -42,7 +42,10 @@ def moved(scene: Path, offset: tuple[float, ...], to: Path) -> Path:
 
 
 def psnr(config: RunConfig, scene: Scene, seed: int | None = None) -> float:
-    """Return the held-out PSNR after a run. With a seed, initial positions are perturbed."""
+    """Return the held-out PSNR after a run.
+
+    If a seed is given, initial positions are changed at random.
+    """
     setup = assemble(config, scene, "colmap")
     state = first_state(setup)
     if seed is not None:
@@ -73,7 +76,7 @@ def main() -> None:
     settings = {"steps": given.steps, "threads": 1, "data": reading}
     with tempfile.TemporaryDirectory() as folder:
         scenes = {}
-        # Write both scenes in the same way, because writing may change the order of the points.
+        # Write both scenes with the same code, because writing may change the order of the points.
         for name, offset in (("in place", (0.0, 0.0, 0.0)), ("moved", given.offset)):
             path = moved(given.scene, offset, Path(folder) / name)
             scenes[name] = read_scene(RunConfig(scene=path, **settings), path)[0]

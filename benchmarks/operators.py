@@ -4,14 +4,14 @@ One JSON line per operator:
 
     python benchmarks/operators.py [OPERATOR ...] [--parameters N] [--repeats N]
 
-The gradients are K = 2 and K = 4 views of `--parameters` float32 numbers in the six blocks of a
-vanilla backbone. `ratio` is (time of the aggregation - time of the additions) / time of the
-additions. The additions are `torch.add(g1, g2, out=)`, repeated for each further view, and
-alternate with the aggregation. The aggregation overwrites the gradients of one view, which are
-restored between repeats. `accumulated_ratio` is the same ratio for operators that need no separate
-gradients, with the views added one by one, as in training. `arithmetic_us` is the operator's own
-arithmetic for six blocks. Times are minima over the repeats. `load` shows other work on the
-machine.
+The gradients are those of K = 2 and K = 4 views, each with `--parameters` float32 numbers in the
+six blocks of a vanilla backbone. `ratio` is (time of the aggregation - time of the additions) /
+time of the additions. The additions are `torch.add(g1, g2, out=)`, repeated for each further view.
+Additions and aggregation are measured alternately. The aggregation overwrites the gradients of one
+view, so these are restored before each repetition. `accumulated_ratio` is the ratio for operators
+that need no separate gradients; the views are then added one by one, as in training.
+`arithmetic_us` is the time of the operator's own arithmetic for six blocks, in microseconds. Times
+are minima over the repetitions. `load` shows how much other work the machine had.
 """
 
 import argparse
@@ -142,7 +142,7 @@ def _least(
     repeats: int,
     prepare: Callable[[], object] = lambda: None,
 ) -> dict[str, float]:
-    """Return the minimum seconds of each function, called alternately after one warm-up call."""
+    """Return the minimum seconds of each function; the functions are called alternately."""
     least = dict.fromkeys(work, float("inf"))
     for repeat in range(repeats + 1):
         for name, run in work.items():
@@ -183,7 +183,7 @@ def _context(gradients: SeparateGradients) -> AggregateContext:
 
 
 def _arithmetic(operator: Operator, views: int) -> float | None:
-    """Return microseconds of `transform` for six blocks, or None for other operators."""
+    """Return the microseconds of `transform` for six blocks; None for other operators."""
     if not isinstance(operator, MatrixOperator):
         return None
     context = _context(_apart(_gradients(views, 6_000)))

@@ -1,13 +1,13 @@
-"""Test the paper's tables and claims on our scenes: tune, run, and write the page of results.
+"""Test the paper's tables and claims on our scenes, and write a page with the results.
 
     python benchmarks/paper.py run [--only GRID,...] [--scenes DIR] [--workers N]
     python benchmarks/paper.py page        # only write the page, from existing runs
     python benchmarks/paper.py estimate    # core hours of each grid
 
-`run` prints the expected time, tunes the learning rates, runs the grids of benchmarks/grids/paper
-and writes docs/results/paper.md. It can be stopped and started at any time, and finished runs are
-not repeated. Tables of finished runs are packed in benchmarks/results/paper. The next call uses
-them, also on another machine.
+`run` prints the expected time, tunes the learning rates, runs the grids of benchmarks/grids/paper,
+and writes docs/results/paper.md. It can be stopped and started again at any time, because finished
+runs are not repeated. Tables of finished runs are packed in benchmarks/results/paper. A later call
+uses these tables, also on another machine.
 """
 
 import argparse
@@ -40,9 +40,9 @@ ROOT = Path(__file__).parents[1]
 #: Tuned arm -> scene -> factor of the learning rates.
 Factors: TypeAlias = Mapping[str, Mapping[str, float]]
 CROSSGRAD = [sys.executable, "-m", "crossgrad_core"]
-#: CPU seconds of a view at 400 px, and CPU seconds of a run in addition to its views (libraries,
-#: scene, evaluation, results). Measured with one run of 1,200 views per scene, two views per step,
-#: on one shared core of an AMD EPYC.
+#: CPU seconds of a view at 400 px, and CPU seconds of a run besides its views (libraries, scene,
+#: evaluation, results). The values were measured with one run of 1,200 views per scene, two views
+#: per step, on one shared core of an AMD EPYC.
 VIEW, BESIDES = 0.049, 12.0
 #: Cost of a view relative to vanilla (docs/benchmarks.md, Cost of backbones).
 COSTS = {
@@ -53,7 +53,7 @@ COSTS = {
     "pixel": 1.1,
     "distance": 1.35,
 }
-#: Seconds that a run needs for the measurements of its gradients.
+#: Seconds that a run needs to measure its gradients.
 PROBES = 25.0
 
 
@@ -64,7 +64,7 @@ class Place:
     Attributes:
         out: Folder of the sweeps and of the grids from which they are run.
         kept: Folder of packed tables of finished runs.
-        page: The page.
+        page: Path of the written page.
     """
 
     out: Path
@@ -76,7 +76,7 @@ class Place:
         return self.out / grid
 
     def grid(self, grid: str) -> Path:
-        """Return the path of the grid that is run, with scenes and learning rates filled in."""
+        """Return the path of the grid that is run, which contains scenes and learning rates."""
         return self.out / "grids" / f"{grid}.yaml"
 
     @property
@@ -114,12 +114,12 @@ class Paper:
 
     @property
     def names(self) -> list[str]:
-        """The measured grids that the user requested, in order."""
+        """The grids that the user requested, in order."""
         only = self.given.only
         return [name for name in self.plan.grids if not only or name in only]
 
     def source(self, name: str) -> Grid:
-        """Return a grid of the repository, on the user's scenes."""
+        """Return a grid of the repository, with the user's scenes."""
         grid = read_grid(GRIDS / f"{name}.yaml")
         folder = self.given.scenes
         wanted = self.given.scene or [folder / scene_name(each) for each in grid.scenes]
@@ -128,7 +128,10 @@ class Paper:
         return grid.model_copy(update={"seeds": tuple(seeds)}) if seeds else grid
 
     def grids(self) -> dict[str, Grid]:
-        """Return every measured grid as it was last run, or else as it is in the repository."""
+        """Return every grid as it was last run.
+
+        Grids that were never run are read from the repository.
+        """
         found = {
             name: read_grid(path) if path.is_file() else self.source(name)
             for name in self.plan.grids
@@ -148,7 +151,7 @@ class Paper:
         sweeps = {name: self.place.sweep(name) for name in grids}
         return read_results(sweeps, grids, self.given.set or ())
 
-    # The following methods are the steps of `run`, in their order.
+    # The following methods are the stages of `run`, in their order.
 
     def unpack(self) -> None:
         """Add finished runs from the packed tables."""
@@ -157,14 +160,14 @@ class Paper:
                 unpack(self.place.archive(name), self.place.sweep(name))
 
     def run(self) -> int:
-        """Tune, run unfinished runs, and write the page.
+        """Tune, start the unfinished runs, and write the page.
 
         Return the exit code.
         """
         self.unpack()
         self.tell()
         worst = self._swept(self.plan.tuning, _as_mapping(self.source(self.plan.tuning)))
-        if worst > 2:  # A signal has stopped the sweep.
+        if worst > 2:  # A signal stopped the sweep.
             return worst
         factors = self._factors()
         for name in self.names:
@@ -172,7 +175,7 @@ class Paper:
             if content is None:
                 continue
             code = self._swept(name, content)
-            if code > 2:  # A signal has stopped the sweep.
+            if code > 2:  # A signal stopped the sweep.
                 return code
             worst = max(worst, code)
             self.write_page()
@@ -214,7 +217,7 @@ class Paper:
         }
 
     def _content(self, name: str, factors: Factors) -> dict[str, Any] | None:
-        """Return a grid with learning rates, or None if the grid has to wait for other grids."""
+        """Return a grid with learning rates; None if it must wait for other grids."""
         grid = self.source(name)
         if name == self.plan.best_of.grid:
             best = self._best(self.results(), self.grids())
@@ -233,7 +236,7 @@ class Paper:
         return _as_mapping(with_rates(grid, rates, factors))
 
     def _best(self, results: Results, grids: Mapping[str, Grid]) -> list[Arm]:
-        """Return the best candidates, or none until all their runs have ended."""
+        """Return the best candidates; none before all their runs have ended."""
         candidates = self.plan.best_of.candidates
         if any(results.missing([name])[1] for name in candidates):
             return []
@@ -288,16 +291,16 @@ class Paper:
 
 
 def own_rate(name: str, plan: Plan, factors: Mapping[str, object]) -> str:
-    """Return the tuned arm whose factors an arm uses."""
+    """Return the tuned arm whose learning-rate factors an arm uses."""
     return name if name in factors else plan.rates.get(name, plan.rates["default"])
 
 
 def with_rates(grid: Grid, rates: Mapping[str, str], factors: Factors) -> Grid:
-    """Return the grid with the factors of tuned arms, by scene.
+    """Return the grid with the learning-rate factors of tuned arms, by scene.
 
     Args:
         grid: A grid.
-        rates: Arm of the grid -> the tuned arm whose factors the arm uses.
+        rates: Arm of the grid -> the tuned arm whose factors it uses.
         factors: Tuned arm -> scene -> factor.
 
     Raises:
@@ -321,7 +324,7 @@ def with_rates(grid: Grid, rates: Mapping[str, str], factors: Factors) -> Grid:
 
 
 def with_methods(grid: Grid, methods: Sequence[Arm]) -> Grid:
-    """Return the grid with each arm repeated for each method, named `BACKBONE, METHOD`."""
+    """Return the grid in which each arm is repeated for each method, named `BACKBONE, METHOD`."""
     arms = [
         Arm(
             name=f"{backbone.name}, {method.name}",
@@ -338,7 +341,7 @@ def _without_probes(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def rate_of(arm: Arm, methods: Sequence[Arm], plan: Plan) -> str:
-    """Return the tuned arm whose factors a method on another backbone uses."""
+    """Return the tuned arm whose learning-rate factors a method uses on another backbone."""
     backbone, _, name = arm.name.partition(", ")
     method = next(each for each in methods if each.name == name)
     if (like := plan.best_of.scaffold_like.get(backbone)) is not None:
@@ -362,18 +365,18 @@ def _as_mapping(grid: Grid) -> dict[str, Any]:
 def _packed(sweep: Path, archive: Path) -> None:
     try:
         pack(sweep, archive)
-    except UserError as error:  # No run has finished. The failures have already been printed.
+    except UserError as error:  # No run has finished. The failures were already printed.
         print(error.what, file=sys.stderr)
 
 
 def _call(arguments: Sequence[str]) -> int:
-    """Run a crossgrad command in its own process, which also receives Ctrl-C."""
+    """Run a crossgrad command in a separate process, which also receives Ctrl-C."""
     process = subprocess.Popen([*CROSSGRAD, *arguments])
     while True:
         try:
             code = process.wait()
         except KeyboardInterrupt:
-            # Wait again, because the process saves checkpoints of its runs before it ends.
+            # Wait again, because the process first saves checkpoints of its runs.
             continue
         return exit_code(-code) if code < 0 else code
 

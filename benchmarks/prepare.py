@@ -2,11 +2,12 @@
 
     python benchmarks/prepare.py PHOTOS SCENE [--truth MODEL ...] [-- OPTION ...]
 
-Each truth is a folder with a COLMAP model of the same photos, matched by name. Several truths must
-be in one frame. The prepared cameras are aligned to this frame by the similarity with which most of
-them agree (RANSAC, then least squares over the agreeing cameras). The remaining error is divided by
-the diagonal of the box around all true cameras. Options after `--` are passed to `crossgrad
-prepare`. If the scene is already finished, the program only evaluates it and shows no times.
+Each `--truth` is a folder with a COLMAP model of the same photos, which are matched by name.
+Several true models must have one coordinate frame. The prepared cameras are aligned to the true
+cameras by a similarity, with RANSAC followed by least squares over the agreeing cameras. The
+remaining error is divided by the diagonal of the box around all true cameras. Options after `--`
+are passed to `crossgrad prepare`. If the scene is already finished, the program only evaluates it
+and shows no times.
 """
 
 import argparse
@@ -42,9 +43,9 @@ def poses_of(folders: Sequence[Path]) -> Poses:
 
 
 def errors_of(found: Poses, truth: Poses) -> tuple[dict[str, tuple[float, float]], float]:
-    """Return two errors for each name, and the size of the scene.
+    """Return for each name a position error and an angle, and the size of the scene.
 
-    The errors are a distance as a share of this size, and an angle in degrees.
+    The position error is a share of this size; the angle is in degrees.
     """
     names = sorted(found.keys() & truth.keys())
     here = np.array([found[name][1] for name in names])
@@ -79,7 +80,7 @@ def prepare(photos: Path, scene: Path, options: Sequence[str]) -> tuple[float, f
 
 
 def rows(scene: Path, truth: Poses) -> list[str]:
-    """Return a line for each folder and a line for all: photos, registered photos, errors."""
+    """Return a line for each folder and a line for all: photos, registered photos and errors."""
     report = json.loads((scene / "report.json").read_text())
     errors, size = errors_of(poses_of([scene / "sparse" / "0"]), truth) if truth else ({}, 0.0)
     lines = []

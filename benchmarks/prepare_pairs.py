@@ -2,11 +2,11 @@
 
     python benchmarks/prepare_pairs.py PHOTOS SCENE --truth MODEL [--truth MODEL ...] [--map]
 
-For each pair of folders, the table counts the photo pairs with verified matches and the wrong photo
-pairs, by number of matches. A pair is wrong if fewer than half of its matches are within four
-pixels of the epipolar lines of the true poses. With `--map`, cameras are found again with only the
-correct pairs, at COLMAP's thresholds and at half of them. This is an upper bound for any selection
-of pairs.
+For each pair of folders, the table counts photo pairs with verified matches, and wrong photo pairs,
+by number of matches. A pair is wrong if fewer than half of its matches are within four pixels of
+the epipolar lines of the true poses. With `--map`, poses are estimated again from only the correct
+pairs, at COLMAP's thresholds and at half of each threshold. The result is an upper bound for any
+method that selects pairs.
 """
 
 import argparse
@@ -29,8 +29,8 @@ BOUNDS = (15, 20, 30, 60, 100)
 #: Maximum distance in pixels between a match and its epipolar line, and minimum share of matches
 #: within this distance.
 NEAR, RIGHT = 4.0, 0.5
-#: Thresholds for a pose: first COLMAP's values, then half of each value. A threshold is a number of
-#: points and a share of the tested points.
+#: Thresholds for a pose: first COLMAP's values, then half of each value. The thresholds are a
+#: number of points and a share of the tested points.
 THRESHOLDS = ((30, 0.25), (15, 0.125))
 
 Matrix = NDArray[np.float64]
@@ -105,7 +105,10 @@ def fundamental(truth: Poses, intrinsics: dict[str, Matrix], first: str, second:
 
 
 def table(pairs: list[Pair]) -> Iterator[str]:
-    """Yield a table by folders and number of matches: pairs, and how many of them are wrong."""
+    """Yield a table of the numbers of pairs and of wrong pairs.
+
+    Each row is a pair of folders. Each column is a range of the number of matches.
+    """
     titles = [f"{low} to {high - 1}" for low, high in itertools.pairwise(BOUNDS)]
     titles.append(f"{BOUNDS[-1]} and more")
     yield "| folders | " + " | ".join(titles) + " |"
@@ -123,7 +126,7 @@ def table(pairs: list[Pair]) -> Iterator[str]:
 
 
 def mapped(photos: Path, source: Path, wrong: list[Pair], truth: Poses) -> Iterator[str]:
-    """Yield the mapping results with only the correct pairs, for each of the thresholds."""
+    """Yield the mapping results from only the correct pairs, for each pair of thresholds."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "database.db"
         shutil.copy(source, path)

@@ -1,12 +1,12 @@
-"""Time a rasterizer forward and backward to all parameters on a fixed case, as one JSON line.
+"""Time a rasterizer, forward and backward, on a fixed case; print one JSON line.
 
     NUMBA_NUM_THREADS=1 python benchmarks/rasterizer.py CASE.npz [--rasterizer numba] [--reps 30]
 
 A case contains `means`, `quats`, `scales`, `opacities`, `colors`, a camera (`viewmat`, `K`,
 `width`, `height`) and `v_image`, the gradient of the loss with respect to the image. Times are
-seconds of wall time, as median and minimum over the repetitions. One untimed repetition before them
-compiles the kernels (its time is `first`). `--save` writes the image and the gradients of
-sum(image * v_image).
+seconds of wall time, as median and minimum over the repetitions. One repetition before the timed
+ones compiles the kernels; its time is printed as `first`. `--save` writes the image and the
+gradients of sum(image * v_image).
 """
 
 import argparse
@@ -41,8 +41,8 @@ def main() -> None:
     parser.add_argument("--reps", type=int, default=30)
     parser.add_argument("--save", type=Path)
     arguments = parser.parse_args()
-    # Use the settings of a run: the same number of threads for torch, and freed arrays that are
-    # kept for the next step.
+    # Use the settings of a run: the same number of threads for torch, and freed memory that is kept
+    # for the next step.
     configure_threads()
     with np.load(arguments.case) as archive:
         case = dict(archive)
@@ -76,7 +76,7 @@ def main() -> None:
 def draw(
     rasterizer: Rasterizer, tensors: dict[str, Tensor], case: dict[str, Any]
 ) -> tuple[float, float, Render]:
-    """Render and differentiate once. Return both durations in seconds and the result."""
+    """Render and differentiate once. Return both durations in seconds, and the result."""
     for tensor in tensors.values():
         tensor.grad = None
     v_image = torch.from_numpy(case["v_image"])

@@ -4,14 +4,14 @@
         [--for-new OPTIONS]
 
 OLD_PYTHON and NEW_PYTHON are the interpreters of two environments on this machine, each with one
-version installed. The cases are every backbone with each densifier, and every operator, sampler and
-grouping at least once. Each case trains the bundled scene for 60 steps with density control from
-step 20 on, is stopped at step 30 and resumed. Tensors, moments, plugin states, random streams, the
-PLY and metrics.csv without its clocks must be equal. The state of slots that only the new version
-has is ignored. The exit status is 1 if there is a difference.
+version installed. The cases contain every backbone with each densifier, and every operator, sampler
+and grouping at least once. Each case trains the bundled scene for 60 steps, with density control
+from step 20 on. It is stopped at step 30 and resumed. Tensors, moments, plugin states, random
+generators, the PLY and metrics.csv (without times) must be equal. States of slots that only the new
+version has are ignored. The exit status is 1 if there is a difference.
 
-If a difference is intended, its commit must explain the difference. If a default changed,
-`--for-new "--schedule-unit steps"` gives the new version options that keep the old behaviour.
+If a difference is intended, the message of the commit must explain it. If a default changed,
+`--for-new "--schedule-unit steps"` gives the new version options that restore the old behaviour.
 """
 
 import argparse
@@ -26,7 +26,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-#: Options of every run. They cause three edits, a reset, and evaluations before and after the stop.
+#: Options of every run. These options cause three edits, an opacity reset, and evaluations before
+#: and after the stop.
 USUAL = (
     *("--steps", "60", "--max-size", "100", "--threads", "1", "--quiet"),
     *("--set", "densify_from=20", "--set", "densify_every=10", "--set", "densify_until=55"),
@@ -35,8 +36,8 @@ USUAL = (
 #: Columns of metrics.csv that differ even between two equal runs.
 CLOCKS = {"train_seconds", "cpu_seconds", "peak_memory_mib"}
 
-#: Program that runs in the tested environment. It receives command lines as JSON and returns exit
-#: codes as JSON.
+#: Program that runs in the tested environment. It reads command lines as JSON and writes exit codes
+#: as JSON.
 CHILD = """
 import contextlib, io, json, sys
 from crossgrad_core.cli.main import main
@@ -71,7 +72,7 @@ class Case:
 
 @dataclass
 class Environment:
-    """A version of crossgrad, driven through one process of its interpreter."""
+    """A version of crossgrad, used through one process of its Python interpreter."""
 
     python: str
     options: tuple[str, ...] = ()
@@ -118,7 +119,10 @@ def cases(names: dict[str, list[str]]) -> Iterator[Case]:
 
 
 def trained(environment: Environment, case: Case, folder: Path) -> tuple[int, str]:
-    """Train a case into `folder`, stopped and resumed. Return exit code and last output."""
+    """Train a case into `folder`, with a stop and a resumption.
+
+    Return the exit code and the last output.
+    """
     arguments = ("run", "--out", str(folder), *case.options, *environment.options, *USUAL)
     code, said = environment.run(*arguments)
     if code != 0:
@@ -166,7 +170,7 @@ def _columns(old: Path, new: Path) -> list[str]:
 
 
 def verdict(case: Case, environments: list[Environment], out: Path) -> tuple[bool, str]:
-    """Return whether both versions agree on a case, and a description."""
+    """Return True if both versions agree on a case, and a description."""
     folders = [out / side / case.name.replace(" ", "-") for side in ("old", "new")]
     ends = [trained(*pair) for pair in zip(environments, [case] * 2, folders, strict=True)]
     codes = [code for code, _ in ends]

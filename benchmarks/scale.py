@@ -2,17 +2,18 @@
 
     python benchmarks/scale.py [--full] [--only TEXT] [--reps N] [--out DIR]
 
-The scene is synthetic and in memory. Cameras in the middle of the scene look in one or ten
-directions. Each camera sees a cloud of Gaussians in front of it. All other Gaussians are outside of
-all views. A `fixed` cell has one direction, so that each step sees the same Gaussians. A `turning`
-cell has ten directions, with a tenth of all Gaussians in each. There, each Gaussian is out of view
-for ten steps on average, and its deferred updates are flushed later. Steps are steps during density
-control, between two edits, with SH degree 3.
+The scene is synthetic and in memory. Cameras are in the middle of the scene and look in one
+direction or in ten directions. Each camera sees a cloud of Gaussians in front of it. All other
+Gaussians are outside all views. A case `fixed` has one direction, so that each step sees the same
+Gaussians. A case `turning` has ten directions, with a tenth of all Gaussians in each. In a case
+`turning`, each Gaussian is out of view for ten steps on average, and its deferred updates are done
+later. Measured steps are during density control, between two edits, with SH degree 3.
 
-Times are CPU seconds. The cells of a group take alternate steps in one process, and ratios are
-medians over pairs with the group's first cell. Memory is the largest resident set of a separate
+Times are CPU seconds. The cases of a group take alternate steps in one process. Ratios are medians
+over pairs of steps with the group's first case. Memory is the peak resident memory of a separate
 process, including the copy for rollback. The bound is the time that memory traffic alone would
-take. It assumes that a step moves every number once, at the bandwidth of a copy on this machine.
+take. The bound assumes that a step moves every number once, with the bandwidth of a copy on this
+machine.
 
 With `--out`, the program writes scale.json and scale.svg.
 """
@@ -40,19 +41,18 @@ if TYPE_CHECKING:
     from crossgrad_core.training.setup import Setup
     from crossgrad_core.training.state import TrainState
 
-#: A step of the published schedule with SH degree 3 that gathers statistics and is far from an
+#: A step of the published schedule with SH degree 3 that collects statistics and is far from an
 #: edit.
 STEP = 5_010
-#: A step in which density control edits.
+#: A step in which density control edits the primitives.
 EDIT = 5_100
-#: Number of steps before the measurement. These steps compile kernels, decode photos and fill
-#: memory.
+#: Number of steps before the measurement. They compile kernels, decode photos and fill memory.
 WARM_UP = 3
 #: Number of photos in each direction.
 PHOTOS = 4
-#: Number of bytes that a step moves per Gaussian of degree 3. First value: for a Gaussian that is
-#: not rendered (11 geometry parameters and their moments, read and written). Second value: for a
-#: rendered Gaussian (59 parameters, their moments and gradients).
+#: Number of bytes that a step moves per Gaussian of SH degree 3. The first value is for a Gaussian
+#: that is not rendered: 11 geometry parameters and their moments are read and written. The second
+#: value is for a rendered Gaussian: 59 parameters with their moments and gradients.
 UNSEEN, SEEN = 11 * 6 * 4, 59 * 8 * 4
 
 
@@ -89,7 +89,7 @@ class Cell:
 
     @property
     def bytes(self) -> int:
-        """Least number of bytes that a step must move."""
+        """Minimum number of bytes that a step must move."""
         drawn = min(self.gaussians, self.visible * min(self.views, self.directions))
         return UNSEEN * (self.gaussians - drawn) + SEEN * drawn
 
@@ -119,9 +119,9 @@ class Noise:
 
 
 def groups(*, full: bool) -> Iterator[tuple[str, list[Cell]]]:
-    """Yield title and cells of each group.
+    """Yield the title and the cases of each group.
 
-    Cells are compared with the first cell of their group.
+    The cases are compared with the first case of their group.
     """
     base = Cell(20_000, 20_000)
     yield "unseen", [base, replace(base, gaussians=200_000)]
@@ -137,7 +137,10 @@ def groups(*, full: bool) -> Iterator[tuple[str, list[Cell]]]:
 
 
 def memory_cells(*, full: bool) -> Iterator[tuple[Cell, bool]]:
-    """Yield cells for memory, and True if the last step edits the set of Gaussians."""
+    """Yield the cases of the memory measurement as pairs of a cell and a flag.
+
+    The flag is True if density control edits the Gaussians in the last step.
+    """
     count = 1_000_000 if full else 200_000
     pair = Cell(count, count, views=2, operator="pcgrad")
     for cell in (pair, replace(pair, visible=count // 10)):
@@ -167,13 +170,13 @@ def scene_of(cell: Cell) -> "Scene":
 
 
 def _view(direction: int, number: int, size: tuple[int, int]) -> "View":
-    """Return photo `number` of a direction, slightly shifted from the other photos."""
+    """Return photo `number` of a direction, with a camera slightly shifted from the others."""
     from crossgrad_core.contract.scene import Camera, View
 
     pose = np.eye(4)
     pose[:3, :3] = _turn(2 * np.pi * direction / 10).T
     pose[:3, 3] = -pose[:3, :3] @ (0.01 * np.array([number, 0.5 * number, 0.0]))
-    # Use a field of view of 30 degrees, so that ten directions do not overlap.
+    # The field of view is 30 degrees, so that ten directions do not overlap.
     focal = 0.5 * size[0] / np.tan(np.deg2rad(15))
     calibration = (focal, focal, size[0] / 2, size[1] / 2)
     camera = Camera(*size, *calibration, torch.from_numpy(pose))
@@ -189,7 +192,7 @@ def _turn(angle: float) -> np.ndarray:
 
 
 def _points(cell: Cell) -> np.ndarray:
-    """Return points [N, 3] in random order: the clouds of all directions, and unseen points."""
+    """Return points [N, 3] in random order: clouds in all directions, and unseen points."""
     rng = np.random.default_rng(0)
     tan = np.tan(np.deg2rad(14))
     depth = rng.uniform(1.0, 2.0, cell.gaussians)
@@ -226,7 +229,7 @@ def setup_of(cell: Cell, **options: object) -> "Setup":
             "max_gaussians": cell.gaussians,
             "growth": "unbounded",
             "schedule_unit": "steps",
-            # Switch dropout off, so that each photo renders all Gaussians in front of its camera.
+            # Turn dropout off, so that each photo renders all Gaussians in front of its camera.
             "rules": {"dropout": False},
             **options,
         }
@@ -261,7 +264,7 @@ class Run:
 
 
 def timed(title: str, cells: list[Cell], reps: int) -> Iterator[dict[str, Any]]:
-    """Yield the medians of the cells of a group, which take alternate steps."""
+    """Yield the medians of a group's cases, which take alternate steps."""
     configure_threads(max(cell.threads for cell in cells))
     runs = [Run(cell) for cell in cells]
     seconds: list[list[tuple[float, float]]] = [[] for _ in runs]
@@ -297,7 +300,7 @@ def bandwidth() -> float:
 
 
 def remembered(cell: Cell, *, edit: bool) -> None:
-    """Print the peak memory of a few steps. It is called in a separate process."""
+    """Print the peak memory of a few steps. This function is called in a separate process."""
     configure_threads(cell.threads)
     run = Run(cell)
     for _ in range(2):

@@ -1,15 +1,15 @@
-"""Count the warnings of the scene check on random contradictory scenes and correct scenes.
+"""Count the warnings of the scene check on contradictory scenes and on correct scenes.
 
     python benchmarks/scene_check.py TOWN TOWN TOWN SCENE SCENE [--wrong 240] [--right 400]
         [--trained 60] [--out FILE]
 
 The towns are made by benchmarks/towns.py, with 24 photos of each kind. Each wrong scene has a
-random kind and strength of error, number of photos and points, crop, ratio of fx to fy, and tracks
-or none. Some wrong scenes are trained for 150 steps on photos of 100 pixels. The correct scene from
-which each was made is trained in the same way. `fall` is the difference in held-out PSNR between
-the two trainings, as a mean by kind and strength. `found` counts the scenes that were reported with
-the correct cause or with the correct photos. Correct scenes have random photos and points, gains,
-noise, JPEG quality and frames. None of them should get a warning.
+random kind and strength of error, number of photos and points, crop, and ratio of fx to fy. Its
+points may have no tracks. Some wrong scenes are trained for 150 steps on photos of 100 pixels. The
+correct scene from which a wrong scene was made is trained in the same way. `fall` is the loss of
+held-out PSNR by the error, as a mean by kind and strength. `found` counts the scenes for which the
+correct cause or the correct photos were reported. Correct scenes have random photos and points,
+gains, noise, JPEG quality and frames. No correct scene should get a warning.
 """
 
 import argparse
@@ -46,11 +46,11 @@ FALL = 3.0
 
 @dataclass(frozen=True)
 class Outcome:
-    """A scene of the search.
+    """The result of a tested scene.
 
     Attributes:
-        seed: Its seed.
-        base: The scene from which it was made.
+        seed: Seed of the scene.
+        base: The correct scene from which it was made.
         kind: Kind of error, or "right" for a correct scene.
         strength: Strength of the error.
         photos: Number of photos.
@@ -58,7 +58,7 @@ class Outcome:
         reported: The reported text.
         found: True if the check reported the correct cause or photos, or nothing for a correct
             scene.
-        fall: Fall of the held-out PSNR in dB, or None if the scene was not trained.
+        fall: Loss of held-out PSNR by the error, in dB; None if the scene was not trained.
         seconds: CPU seconds of the check.
     """
 
@@ -82,7 +82,7 @@ def base(path: Path, size: int) -> Model:
 
 
 def trained_psnr(scene: Scene, path: Path, steps: int) -> float:
-    """Return the held-out PSNR after a short training, or 0 if training refuses the scene."""
+    """Return the held-out PSNR after a short training; 0 if training refuses the scene."""
     try:
         return _psnr(scene, path, steps)
     except UserError:
@@ -115,7 +115,7 @@ def text_of(verdict: Verdict) -> str:
 
 
 def is_found(wrong: Wrong, verdict: Verdict) -> bool:
-    """Return True if the correct cause, or roughly the correct photos, were reported."""
+    """Return True if the correct cause or nearly the correct photos were reported."""
     causes = [each.what for each in (verdict.all_wrong, *verdict.some_wrong) if each is not None]
     named = {view for cause in verdict.some_wrong for view in cause.views}
     if not wrong.views:
@@ -126,9 +126,9 @@ def is_found(wrong: Wrong, verdict: Verdict) -> bool:
 
 
 def wrong_scene(path: Path, seed: int, size: int, steps: int | None) -> Outcome:
-    """Return the outcome of a scene that contradicts itself.
+    """Return the result for a scene that contradicts itself.
 
-    The scene is trained if steps are given.
+    The scene is trained only if a number of steps is given.
     """
     rng = np.random.default_rng(seed)
     right = varied(base(path, size), rng)
@@ -156,7 +156,7 @@ def wrong_scene(path: Path, seed: int, size: int, steps: int | None) -> Outcome:
 
 
 def right_scene(path: Path, seed: int, size: int) -> Outcome:
-    """Return the outcome of a correct scene."""
+    """Return the result for a correct scene."""
     rng = np.random.default_rng(seed)
     model = harmless(varied(base(path, size), rng), rng)
     scene = model.scene()

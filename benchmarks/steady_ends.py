@@ -1,10 +1,10 @@
-"""Print the jitter of the test PSNR at the end of finished runs, as a table.
+"""Print how much the test PSNR varies at the end of finished runs, as a table.
 
     crossgrad sweep benchmarks/grids/steady_ends.yaml --scene SCENE
     python benchmarks/steady_ends.py runs/sweeps/steady_ends
 
-For each run, a straight line is fitted to the PSNR of the evaluations in the last tenth. The
-jitter is the deviation from this line. This script does not import torch.
+For each run, a straight line is fitted to the PSNR of the evaluations in the last tenth of the
+steps. The jitter is the standard deviation from this line. This script does not import torch.
 """
 
 import argparse
@@ -17,15 +17,15 @@ import numpy as np
 
 from crossgrad_core.run.results.reading import RunResults, find_runs, read_run
 
-#: Minimum number of evaluations in the last tenth of a run for a measurement of jitter.
+#: Minimum number of evaluations in the last tenth of a run that are needed to compute the jitter.
 FEWEST = 10
 LAST = 0.1
 
 
 def jitter(steps: Sequence[float], values: Sequence[float]) -> float:
-    """Return the standard deviation of values around their straight line over the steps.
+    """Return the standard deviation of values from their straight line over the steps.
 
-    The line uses two degrees of freedom. The result has the unit of the values.
+    The fit of the line uses two degrees of freedom. The result has the unit of the values.
     """
     x, y = np.asarray(steps, dtype=np.float64), np.asarray(values, dtype=np.float64)
     rest = y - np.polyval(np.polyfit(x - x.mean(), y, 1), x - x.mean())
@@ -42,7 +42,7 @@ def last_tenth(run: RunResults) -> tuple[list[float], list[float]]:
 
 
 def arm(run: RunResults) -> tuple[str, str, str, str]:
-    """Return scene, growth setting, and the rules that act at the end of a run."""
+    """Return scene and growth mode of a run, and the rules that act at its end."""
     rules = dict(run.config.get("rules") or {})
     tail, average = (rules.get(name) or {} for name in ("lr-tail", "weight-averaging"))
     fades, averages = (float(each.get("share", 0.0)) for each in (tail, average))

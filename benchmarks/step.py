@@ -1,18 +1,18 @@
 """Measure the median seconds of a whole training step on a fixed case, as one JSON line.
 
-A step has the same parts as in a run: decode with SH degree 3, render, loss against a random photo,
-backward pass, and one Adam step. The Adam step of positions is along the axes of their Gaussians.
-The Adam step of colours uses sparse rows: it updates the drawn rows, after their deferred updates
-are flushed. Each timed step follows a step with another view, rotated by `--turn`, so that some
-rows have deferred updates. With two threads, the Adam step of colours overlaps with the next step.
-The time `render` of the next step then includes the rest of the Adam step. This does not happen
-with `--sh-every`, because two kinds of steps alternate.
+A step has the parts of a step in a run: decoding with SH degree 3, rendering, loss against a random
+photo, backward pass, and one Adam step. The Adam step of positions is scaled along the axes of
+their Gaussians. The Adam step of colours updates only the drawn rows, after their deferred updates
+are done. Each timed step follows a step with another view, rotated by `--turn`, so that some rows
+have deferred updates. With two threads, the Adam step of colours continues during the next step.
+The time `render` of the next step then includes the end of the Adam step. With `--sh-every`, this
+does not happen, because two kinds of steps alternate.
 
     python benchmarks/step.py CASE.npz [--reps N] [--threads N] [--max-alpha A] [--turn DEGREES]
         [--sh-every N]
 
-With `--sh-every N`, the bands above the first are updated in one of N steps. Figures are then means
-over N steps, from the medians of both kinds of steps.
+With `--sh-every N`, SH bands above the first are updated in only one of N steps. The printed times
+are then means over N steps, computed from the medians of both kinds of steps.
 """
 
 import argparse
@@ -42,12 +42,12 @@ from crossgrad_core.training.adam.late import Late
 from crossgrad_plugins.losses.l1_ssim import photometric_loss
 from crossgrad_plugins.rasterizers.numba_cpu import NumbaRasterizer
 
-#: In the published schedule, this step is late enough for SH degree 3.
+#: At this step of the published schedule, SH degree 3 is active.
 STEP = 5000
 
 
 def parameters_of(case: dict[str, np.ndarray]) -> dict[str, Tensor]:
-    """Return the case as vanilla parameters, with small random higher bands."""
+    """Return the case as vanilla parameters, with small random SH coefficients of higher bands."""
     count = case["means"].shape[0]
     opacities = torch.from_numpy(case["opacities"]).clamp(1e-4, 1 - 1e-4)
     rest = torch.from_numpy(np.random.default_rng(0).normal(0, 0.02, (count, 15, 3))).float()
@@ -63,7 +63,7 @@ def parameters_of(case: dict[str, np.ndarray]) -> dict[str, Tensor]:
 
 
 def camera_of(case: dict[str, np.ndarray], degrees: float) -> Camera:
-    """Return the case's camera, rotated about its own vertical axis."""
+    """Return the camera of the case, rotated about the camera's vertical axis."""
     k = case["K"].astype(np.float64)
     cosine, sine = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     turn = np.array([[cosine, 0, sine, 0], [0, 1, 0, 0], [-sine, 0, cosine, 0], [0, 0, 0, 1]])
@@ -81,13 +81,14 @@ class Trainer:
         self.rasterizer = NumbaRasterizer(max_alpha=max_alpha, near=0.01)
         self.phase = Phase(STEP, training=True, schedule=Schedule.for_run(30_000))
         self.state, self.late = AdamState(), Late()
-        #: True if every step must be complete before the next step starts.
+        #: True if every step must be finished before the next step starts.
         self.apart = False
-        # Use learning rates of zero. All repetitions then have the same case and the same cost.
+        # Set the learning rates to zero. All repetitions then have the same parameters and the same
+        # cost.
         self.rates = dict.fromkeys(self.parameters, 0.0)
 
     def step(self, camera: Camera, photo: Tensor, *, rests: bool) -> Iterator[str]:
-        """Take a step, and yield the name of each of its parts when the part is finished."""
+        """Take a step, and yield the name of each part when the part is finished."""
         resting = {name for b in self.backbone.trained_blocks() if b.rests for name in b.tensors}
         tensors = {
             name: tensor.detach() if rests and name in resting else tensor
@@ -149,16 +150,16 @@ def main() -> None:
     photo = torch.from_numpy(np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8))
     every = arguments.sh_every
     parts = ("render", "loss", "backward", "adam")
-    # Separate times of steps that update all SH bands and of steps that skip the higher bands.
+    # Times of steps that update all SH bands, and of steps that skip the higher bands.
     marks: list[dict[str, list[float]]] = [{name: [] for name in parts} for _ in range(2)]
     for repetition in range(2 * (arguments.reps + 2) * min(every, 2)):
-        # A step that skips bands comes after a step that renders the other view and updates these
+        # Before a step that skips bands, take a step that renders the other view and updates these
         # bands.
         rests = every > 1 and repetition % 4 == 3
         start = perf_counter()
         for name in trainer.step(views[repetition % 2], photo, rests=rests):
             end = perf_counter()
-            # Do not measure the first steps, which compile kernels and warm up.
+            # Do not measure the first steps, because they compile kernels.
             if repetition >= 4 * min(every, 2) and repetition % 2:
                 marks[rests][name].append(end - start)
             start = perf_counter()

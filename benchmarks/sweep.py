@@ -1,11 +1,11 @@
-"""Measure the throughput of a sweep with several workers, relative to the same runs in sequence.
+"""Measure the throughput of a sweep with several workers, relative to runs in sequence.
 
     python benchmarks/sweep.py [SCENE] [--runs 6] [--steps 400] [--max-size 400] [--workers 2]
 
-Times three sweeps of the same runs: in sequence with one thread, in sequence with as many threads
-as there are workers, and with all workers, each with one thread. For comparison, it also times as
-many simultaneous `crossgrad run` processes, started by hand, and a single process. The figures are
-only meaningful on a machine without other work.
+The program times three sweeps of the same runs. The first uses one thread, in sequence. The second
+uses one thread per worker, in sequence. The third uses all workers at the same time, with one
+thread each. For comparison, it also times the same number of simultaneous `crossgrad run`
+processes, and a single process. The results are only meaningful on a machine without other work.
 """
 
 import argparse
@@ -25,7 +25,7 @@ CROSSGRAD = [sys.executable, "-m", "crossgrad_core"]
 
 
 def call(command: list[str]) -> None:
-    """Run a command. If it fails, exit with its output."""
+    """Run a command. If the command fails, exit with its output."""
     done = subprocess.run(command, check=False, capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(f"{' '.join(command)} failed:\n{done.stdout}{done.stderr}")
@@ -41,7 +41,7 @@ def swept(grid: Path, out: Path, workers: int, threads: int) -> float:
 
 
 def by_hand(arguments: argparse.Namespace, folder: Path, count: int) -> float:
-    """Return the seconds of `count` runs that are started at once, each with one thread."""
+    """Return the seconds of `count` simultaneous runs, each with one thread."""
     start = time.monotonic()
     runs = [subprocess.Popen(
         [*CROSSGRAD, "run", str(arguments.scene), "--steps", str(arguments.steps), "--threads", "1",

@@ -1,25 +1,25 @@
-r"""Compare the final quality of runs with a time limit between the code of several commits.
+r"""Compare the final quality of runs with a time limit between several commits.
 
     python benchmarks/time_to_quality.py run OUT --scene SCENE [--scene SCENE ...] --core 0 \
         --code old=VENV_OLD/bin/crossgrad --code "new=VENV/bin/crossgrad --split every" \
         --seconds 5 10 20 30:10 70:23.3 140:46.7 --seeds 1 2 3 4 5 6
     python benchmarks/time_to_quality.py table OUT
 
-`30:10` gives the first code 30 seconds and the second code 10 seconds. On a machine with other
-users, `--steps` instead of `--seconds` ends runs after a number of steps. The PLY files of both
-codes are drawn on the held-out views of the last code, which the first code must also hold out.
-Photos have 400 px, or the size given by `--max-size` (0: the default size). A run uses one thread
-for each named core (Linux). The runs of a pair follow each other on these cores. Finished runs are
-not repeated. Figures are measured on the exported PLY on black, drawn by `crossgrad eval --ply`
-and, if `--max-size` is not 0, by `viewer.py`. `table OUT --figure NAME` compares another figure of
-the held-out views in summary.json, such as `ssim`.
+The text `30:10` gives the first code 30 seconds and the second code 10 seconds. On a machine with
+other users, use `--steps` instead of `--seconds` to end runs after a number of steps. The PLY files
+of both codes are drawn on the held-out views of the last code. The first code must hold out these
+views, too. Photos have a longer side of 400 px, or of `--max-size` (0: the default size). A run
+uses one thread for each named core (Linux). The two runs of a pair follow each other on these
+cores. Finished runs are not repeated. PSNR is measured on the exported PLY on black, drawn by
+`crossgrad eval --ply` and, if `--max-size` is not 0, also by `viewer.py`. `table OUT --figure NAME`
+compares another metric of the held-out views in summary.json, such as `ssim`.
 
     python benchmarks/time_to_quality.py run OUT --scene SCENE [--scene SCENE ...] --core 0 1 \
         --code long=VENV/bin/crossgrad --code new=VENV/bin/crossgrad --max-size 0 --seconds 600:60
     python benchmarks/time_to_quality.py share OUT
 
-compares short runs with long runs of the same code. The share is the gain of the short run divided
-by the gain of the long run; a gain is measured in dB above a picture of the training photos' mean
+compares short runs with long runs of one code. The share is the gain of the short run divided by
+the gain of the long run. A gain is the PSNR minus the PSNR of an image in the training photos' mean
 colour.
 """
 
@@ -52,7 +52,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Code:
-    """A commit: its name, its `crossgrad` program, and options of `crossgrad run`."""
+    """A commit with its name, its `crossgrad` program, and options of `crossgrad run`."""
 
     name: str
     program: str
@@ -60,13 +60,13 @@ class Code:
 
     @classmethod
     def of(cls, text: str) -> "Code":
-        """Parse a text `NAME=CROSSGRAD [OPTIONS]` into a name, a command and its options."""
+        """Parse a text `NAME=CROSSGRAD [OPTIONS]`."""
         name, _, words = text.partition("=")
         program, *options = shlex.split(words)
         return cls(name, program, tuple(options))
 
     def train(self, scene: Path, folder: Path, threads: int, size: int, *length: str) -> None:
-        """Train into a folder, which must not exist."""
+        """Train into a folder, which must not exist before."""
         command = [self.program, "run", str(scene), "--out", str(folder)]
         command += ["--threads", str(threads), *(["--max-size", str(size)] if size else [])]
         command += [*length, *self.options]
@@ -74,15 +74,15 @@ class Code:
 
 
 def run(given: argparse.Namespace) -> None:
-    """Run missing cases."""
+    """Start the runs of missing cases."""
     os.sched_setaffinity(0, given.core)
     kind = len(given.core), given.max_size
     codes = [Code.of(text) for text in given.code]
     for code in codes:
-        # Compile all kernels that a run needs before any timed run.
+        # Compile all kernels that a run needs before the first timed run.
         warm = given.out / f"warm-up-{code.name}-{given.core[0]}"
         if not warm.exists():
-            # Without a time budget, the option --clock is refused.
+            # Without a time limit, crossgrad refuses the option --clock.
             timed = any(option.partition("=")[0] == "--clock" for option in code.options)
             length = ("--seconds", "60") if timed else ("--steps", "700")
             code.train(given.scene[0], warm, *kind, *length)
@@ -108,7 +108,7 @@ def run(given: argparse.Namespace) -> None:
 
 
 def _finished(folder: Path) -> bool:
-    """Return whether a run has finished regularly."""
+    """Return True if a run has finished."""
     path = folder / "summary.json"
     return path.exists() and json.loads(path.read_text())["status"] == "finished"
 
@@ -127,7 +127,7 @@ def _cases(given: argparse.Namespace) -> Iterator[tuple[int, Path, str]]:
 
 
 def _figures(folder: Path, judge: Path, *, independent: bool) -> Row:
-    """Return the metrics of a run, with its PLY drawn on the held-out views of another run."""
+    """Return the metrics of a run's PLY, drawn on the held-out views of another run."""
     if _held_out(folder) != _held_out(judge):
         raise SystemExit(
             f"{folder} and {judge} do not hold out the same views: give both a --split"
@@ -176,8 +176,8 @@ def table(given: argparse.Namespace) -> None:
     old: dict[tuple[str, str], dict[int, Row]] = {}
     for (scene, lengths), codes in cases:
         if "old" in codes:
-            # If a case was run without the code `old`, compare it with the first case of equal
-            # length that was run with `old`.
+            # If a case was not run with the code `old`, compare it with the first case of equal
+            # length that was.
             old[scene, lengths] = codes["old"]
             first, _, unit = lengths.partition(" ")
             alone = " ".join([first.split(":")[0], *([unit] if unit else [])])
@@ -187,7 +187,7 @@ def table(given: argparse.Namespace) -> None:
 
 
 def _told(folder: Path, figure: str) -> float:
-    """Return a metric value of a run, over all held-out views."""
+    """Return a metric of a run over all held-out views."""
     return float(json.loads((folder / "summary.json").read_text())["overall"][figure])
 
 
@@ -197,9 +197,9 @@ def _print_gains(
     old: Mapping[tuple[str, str], dict[int, Row]],
     figure: str | None,
 ) -> None:
-    """Print the gains of a code version over `old`: by scene, and pooled.
+    """Print the gains of a code over `old`, by scene and pooled.
 
-    Scenes with equal lengths of runs are pooled.
+    Scenes whose runs have equal lengths are pooled.
     """
     gains: dict[str, dict[str, list[float]]] = defaultdict(dict)
     margin, digits = (0.005, 4) if figure == "ssim" else (0.1, 2)
@@ -236,7 +236,7 @@ def _gain(each: Estimate, digits: int) -> Iterator[str]:
 
 
 def share(given: argparse.Namespace) -> None:
-    """Print which share of the gain of `long` over the mean colour `new` reaches."""
+    """Print the share of the gain of `long` over the mean colour that `new` reaches."""
     by_case: dict[tuple[str, str, int], dict[str, Row]] = defaultdict(dict)
     for path in sorted(given.out.glob("*/row.json")):
         row = json.loads(path.read_text())
@@ -257,7 +257,7 @@ def share(given: argparse.Namespace) -> None:
 
 
 def _first(lengths: str) -> float:
-    """Return the length of the runs of the first code version."""
+    """Return the length of the runs of the first code."""
     return float(lengths.partition(" ")[0].split(":")[0])
 
 
@@ -274,7 +274,7 @@ def _cells(own: list[Row]) -> Iterator[str]:
 
 
 def main() -> None:
-    """Run missing cases or print a table."""
+    """Start missing runs, or print a table."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     commands = parser.add_subparsers(required=True)
     runs = commands.add_parser("run", help="run missing cases")

@@ -2,12 +2,13 @@
 
     python benchmarks/towns.py --seed 1 --out FOLDER [--aerial 64] [--street 64]
 
-A town consists of boxes and trees along a grid of roads (_town_photos.py). Each seed gives other
-streets, heights, patterns, sun and drone flights. The drone flies in rings looking in, in lines
-looking down, or anywhere looking obliquely, 60 to 115 m above ground. Street photos are taken 2 m
-above ground. Points come from the depths of the training photos, with a deviation of 2 cm. Each
-point has up to two further observations in its own kind of photos, and one in the other kind. Every
-eighth photo of each kind gives no points, because `crossgrad run --split every` holds it out.
+A town consists of boxes and trees along a grid of roads (_town_photos.py). Each seed gives another
+town: other streets, heights, patterns, sun and drone flights. The drone flies 60 to 115 m above
+ground. It flies in rings and looks inwards, in lines and looks down, or anywhere and looks
+obliquely. Street photos are taken 2 m above ground. Points are computed from the depths of the
+training photos, with a random error of 2 cm. Each point has up to two further observations in
+photos of its own kind (aerial or street), and one in a photo of the other kind. Every eighth photo
+of each kind gives no points, because `crossgrad run --split every` holds it out.
 """
 
 import argparse
@@ -22,15 +23,15 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-#: Number of rays of a pixel in each direction.
+#: Number of rays of a pixel in x, and also in y.
 RAYS: Final = 2
 POINTS: Final = 40_000
 #: Half of the horizontal field of view, in degrees.
 HALF_ANGLE: Final = {"aerial": 25, "street": 35}
 Integers: TypeAlias = NDArray[np.int64]
-#: Number of blocks and roads in each direction from the middle.
+#: Number of blocks and roads from the middle of the town in each direction.
 REACH: Final = 2
-#: Among the photos of each kind, one photo out of this many photos is held out.
+#: One of this many photos of each kind is held out.
 EVERY: Final = 8
 
 
@@ -41,8 +42,8 @@ class Town:
     Attributes:
         pitch: Distance between roads in metres.
         road: Width of a road in metres.
-        boxes: [B, 10], as in _town_photos.py.
-        trees: [T, 5], as in _town_photos.py.
+        boxes: [B, 10] boxes, as in _town_photos.py.
+        trees: [T, 5] trees, as in _town_photos.py.
         sun: Unit vector towards the sun.
     """
 
@@ -53,7 +54,7 @@ class Town:
     sun: Vector
 
     def holds(self, point: Array) -> bool:
-        """Return whether a point is inside or close to an object."""
+        """Return True if a point is inside an object or close to it."""
         for box in self.boxes:
             x, y = point[:2] - box[:2]
             across, along = box[6] * x + box[7] * y, box[6] * y - box[7] * x
@@ -71,9 +72,9 @@ class View:
     Attributes:
         kind: Folder of the photo.
         number: Index among the photos of its kind.
-        eye: [3] the camera's centre.
+        eye: [3] centre of the camera.
         axes: [3, 3] camera axes to the right, down and ahead.
-        width: Width in pixels. The height is 5/8 of the width.
+        width: Width in pixels; the height is 5/8 of the width.
     """
 
     kind: str
@@ -98,7 +99,7 @@ class View:
         return self.width / 2 / math.tan(math.radians(HALF_ANGLE[self.kind]))
 
     def project(self, points: Array) -> Array:
-        """Return points [N, 3] as pixels and depth."""
+        """Return the pixels and depths of points [N, 3]."""
         local = (points - self.eye) @ self.axes.T
         with np.errstate(divide="ignore", invalid="ignore"):
             at = local[:, :2] / local[:, 2:] * self.focal + np.array(self.size) / 2
@@ -106,7 +107,7 @@ class View:
 
 
 def _houses(rng: np.random.Generator, x: float, y: float, half: float) -> list[list[float]]:
-    """Return the boxes of one block around (x, y)."""
+    """Return the boxes of one block of houses around (x, y)."""
     rows, boxes = int(rng.integers(2, 4)), []
     side = 2 * half / rows
     for place in range(rows * rows):
@@ -127,7 +128,7 @@ def _houses(rng: np.random.Generator, x: float, y: float, half: float) -> list[l
 
 
 def _beside_roads(rng: np.random.Generator, count: int, pitch: float, off: float) -> list[Vector]:
-    """Return places `off` metres from the middles of roads, and 1 if the road is along y."""
+    """Return places at the distance `off` from the middles of roads, and 1 for roads along y."""
     places = []
     for _ in range(count):
         line = rng.integers(-1, 2) * pitch + rng.choice([-1, 1]) * off
@@ -165,7 +166,7 @@ def build(rng: np.random.Generator) -> Town:
 
 
 def _looking(eye: Array, at: Array) -> Array:
-    """Return the axes of a camera at `eye` that looks at a point, with a level horizon."""
+    """Return the axes of a camera at `eye` that looks at a point; the horizon is level."""
     ahead = (at - eye) / np.linalg.norm(at - eye)
     up = np.array([0.0, 0.0, 1.0] if abs(ahead[2]) < 0.999 else [0.0, 1.0, 0.0])
     right = np.cross(ahead, up)
@@ -177,7 +178,8 @@ def fly(rng: np.random.Generator, town: Town, count: int, width: int) -> list[Vi
     """Return the photos of the drone."""
     way = rng.integers(0, 3)
     low, high = sorted(rng.uniform(60, 115, 2))
-    # Use one row more than the square root, so that held-out photos are not all in one column.
+    # Use one row more than the square root, because the held-out photos would otherwise all be in
+    # one column.
     views, rows = [], math.isqrt(count) + 1
     for i in range(count):
         z, share = rng.uniform(low, high), i / count
@@ -202,7 +204,7 @@ def _vector(row: Array) -> Vector:
 
 
 def walk(rng: np.random.Generator, town: Town, count: int, width: int) -> list[View]:
-    """Return street photos along or across the road, without objects within 4 m in the middle."""
+    """Return street photos along or across roads, with at least 4 m of free space in the middle."""
     views: list[View] = []
     while len(views) < count:
         line = rng.integers(-1, 2) * town.pitch + rng.uniform(-0.4, 0.4) * town.road
@@ -246,7 +248,7 @@ def _sampled(rng: np.random.Generator, view: View, depth: Array, count: int) -> 
 
 
 def _sees(view: View, depth: Array, points: Array) -> NDArray[np.bool_]:
-    """Return for each point [N] whether a photo shows it without occlusion."""
+    """Return [N], True for points that a photo shows without occlusion."""
     (u, v, z), (width, height) = view.project(points).T, view.size
     inside = (z > 0.1) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
     column = np.where(inside, u, 0).astype(int)
@@ -261,7 +263,7 @@ def _tracks(
     points: Array,
     source: Integers,
 ) -> list[list[int]]:
-    """Return the photos of each point, beginning with the photo from which the point was taken."""
+    """Return the photos of each point; the first is the photo from which the point was computed."""
     sees = np.array([_sees(v, d, points) for v, d in zip(views, depths, strict=True)])
     kinds = np.array([view.kind for view in views])
     tracks = []

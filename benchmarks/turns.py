@@ -3,14 +3,14 @@
     python benchmarks/turns.py CASE.npz --beside CHECKOUT [--threads N] [--rounds N]
     python benchmarks/turns.py CASE.npz [--rounds N]
 
-Shared machines change their speed within seconds, so two successive runs would compare times of day
-instead of commits. Here both sides exist all the time, and only one of them takes a step at a time.
-With `--beside`, the sides are this checkout and an older checkout with an environment from `make
-install`. Without `--beside`, the sides are one process with two threads, and two simultaneous
-processes with one thread each on their own cores. The output is one JSON line: medians of the
-seconds, and median and quartiles of the quotients by round. The quotient is this checkout's seconds
-over the other checkout's seconds, or the step rate of two threads over the step rate of two
-processes.
+Shared machines change their speed within seconds, so two measurements one after the other could not
+be compared. Here, the two measured variants are in memory all the time, and only one of them takes
+a step at a time. With `--beside`, the variants are this checkout and an older checkout with an
+environment from `make install`. Without `--beside`, the variants are one process with two threads,
+and two simultaneous processes with one thread each on separate cores. The output is one JSON line:
+medians of the seconds, and median and quartiles of the quotients over the rounds. The quotient is
+this checkout's seconds divided by the other checkout's seconds, or the step rate of two threads
+divided by the step rate of two processes.
 """
 
 import argparse
@@ -35,9 +35,9 @@ class Worker:
 
     Args:
         checkout: Folder of the checkout.
-        case: The case.
-        threads: Threads of the step.
-        core: Core on which it runs, or None for any core.
+        case: The case file.
+        threads: Number of threads of the step.
+        core: Core on which the process runs; None for any core.
     """
 
     def __init__(self, checkout: Path, case: Path, threads: int, core: int | None = None) -> None:
@@ -103,7 +103,7 @@ def work(checkout: Path, case: Path, threads: int) -> None:
 
 
 class Plain:
-    """The step of commits up to e216204, whose benchmark consists of one function."""
+    """The step of commits up to e216204, whose benchmark is a single function."""
 
     def __init__(self, steps: Any, case: dict[str, Any]) -> None:  # noqa: ANN401 - a module of another checkout
         self.steps, self.parameters = steps, steps.parameters_of(case)
@@ -126,12 +126,12 @@ class Plain:
 
 
 def beside(case: Path, other: Path, threads: int, rounds: int) -> dict[str, Any]:
-    """Return times of alternating steps of this checkout and the other checkout."""
+    """Return the times of alternating steps of this checkout and of the other checkout."""
     core = 0 if threads == 1 else None
     workers = [Worker(HERE, case, threads, core), Worker(other, case, threads, core)]
     seconds: list[list[float]] = [[], []]
     for turn in range(WARM_UP + rounds):
-        # The two checkouts take turns at making the first step of a round.
+        # The two checkouts alternate in taking the first step of a round.
         for side in (0, 1) if turn % 2 else (1, 0):
             took = workers[side].step()
             if turn >= WARM_UP:
@@ -148,7 +148,7 @@ def beside(case: Path, other: Path, threads: int, rounds: int) -> dict[str, Any]
 
 
 def two_ways(case: Path, rounds: int) -> dict[str, Any]:
-    """Return times of two threads in one process and of two simultaneous processes."""
+    """Return the times of two threads in one process, and of two simultaneous processes."""
     both = Worker(HERE, case, 2)
     apart = [Worker(HERE, case, 1, core) for core in (0, 1)]
     together, alone = [], []

@@ -1,13 +1,13 @@
-"""Compare two views per step with one: the tables of docs/results/two-views.md.
+"""Compare two views per step with one view: the tables of docs/results/two-views.md.
 
     crossgrad sweep benchmarks/grids/two_views_tuning.yaml
     crossgrad sweep benchmarks/grids/two_views_tuning.yaml --best benchmarks/grids/two_views.yaml
     crossgrad sweep benchmarks/grids/two_views.yaml
     python benchmarks/two_views.py runs/sweeps/two-views-best > tables.md
 
-Each arm occurs twice: at its own best factor of the learning rates on each scene, and at the
-published rates. Differences are paired by scene and seed. Verdicts are computed as in
-`crossgrad compare` and corrected over each table. This script does not import torch.
+Each arm occurs twice: with its best learning-rate factor on each scene, and with the published
+learning rates. Differences are paired by scene and seed. Verdicts are computed as in `crossgrad
+compare` and corrected over each table. This script does not import torch.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from crossgrad_plugins.compare.narrative import needed_text, verdict_text
 from crossgrad_plugins.compare.statistics import Verdict
 
 ONE, TWO = "one view", "two views"
-#: Quantity that is equal in a comparison -> its two arms, the arm with two views first.
+#: Quantity that is equal in a comparison -> its two arms; the arm with two views is first.
 PAIRS = {
     "seconds": (f"{TWO}, equal seconds", f"{ONE}, equal seconds"),
     "views, events and count": (
@@ -43,7 +43,7 @@ PAIRS = {
         f"{ONE}, equal views, statistics of an extra render",
     ),
 }
-#: Title of a table -> last part of the names of its arms.
+#: Title of a table -> last part of the names of the arms in it.
 RATES = {"at the best rates": ", best", "at the published rates": ""}
 
 
@@ -64,7 +64,7 @@ def differences(runs: Runs, ending: str) -> Iterator[str]:
 
 
 def pooled(found: Contrast) -> str:
-    """Return the pooled difference with its interval, and its verdict, as two cells."""
+    """Return two cells: the pooled difference with its interval, and the verdict."""
     verdict = verdict_text(found)
     if found.verdict is Verdict.INCONCLUSIVE:
         verdict += f": {needed_text(found)}"

@@ -1,7 +1,7 @@
-"""Render a PLY independently for checks, in numpy and float64, one Gaussian after the other.
+"""Render a PLY with independent code, in NumPy and float64, one Gaussian after the other.
 
-It reads the file and draws it by the published rules without code of crossgrad, so that the figures
-of a run for its file can be checked independently.
+This program reads and draws the file by the published rules, without code of crossgrad. The results
+of a run for its PLY can therefore be checked independently.
 
     python benchmarks/viewer.py RUN [--ply FILE]      # PSNR of the held-out photos, on black
 """
@@ -18,8 +18,8 @@ import crossgrad_core as cg
 
 Array = NDArray[np.float64]
 
-#: Constants of 3DGS: minimum alpha, maximum alpha, transmittance at which a pixel ends, dilation in
-#: px^2, near plane in camera units, and margin for clamping the Jacobian.
+#: Constants of 3DGS: minimum alpha, maximum alpha, transmittance at which a pixel is finished,
+#: dilation in px^2, near plane in camera units, and margin for the limits of the Jacobian.
 LEAST, CAP, STOP, DILATION, NEAR, MARGIN = 1 / 255, 0.99, 1e-4, 0.3, 1e-3, 1.3
 
 
@@ -34,7 +34,7 @@ def read(path: Path) -> dict[str, Array]:
 
 
 def harmonics(d: Array, bands: int) -> Array:
-    """Return real spherical harmonics [N, bands] of unit directions [N, 3], signs as in 3DGS."""
+    """Return real spherical harmonics [N, bands] of unit directions [N, 3], as in 3DGS."""
     x, y, z = d.T
     xx, yy, zz = x * x, y * y, z * z
     found = [
@@ -117,7 +117,7 @@ class Projection:
 
     @cached_property
     def reach(self) -> tuple[Array, Array]:
-        """[2] and [2]: the smallest and the largest x / z and y / z that the Jacobian uses."""
+        """Minimum [2] and maximum [2] of x / z and y / z in the Jacobian."""
         focal, center = np.diag(self.k)[:2], self.k[:2, 2]
         low, high = -center / focal, (np.array(self.size) - center) / focal
         margin = (MARGIN - 1) / 2 * (high - low)

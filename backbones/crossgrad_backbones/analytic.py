@@ -12,16 +12,15 @@ from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_backbones.visibility import NEAR
 from crossgrad_core.plugin import Camera, Gaussians, Phase, Response
 
-#: Variance of a window of one pixel, px^2. Integration over the window adds this variance to the
-#: variance of a Gaussian.
+#: Variance of a box of one pixel, in px^2. Integrating a Gaussian over a pixel adds this variance
+#: to the variance of the Gaussian.
 PIXEL_VARIANCE = 1.0 / 12.0
 
 
 class AnalyticSplatting(Vanilla):
-    """The 3DGS representation, rendered with the pixel response `analytic` and without dilation.
+    """The 3DGS representation with the pixel response `analytic` and without dilation.
 
-    Source: Analytic-Splatting, methods of section 4; the optional filters of the paper are not
-    implemented.
+    Source: Liang et al. 2024. The optional filters of the paper are not implemented.
     """
 
     response: ClassVar[Response] = "analytic"

@@ -1,4 +1,4 @@
-"""Conversion of Gaussians of another pixel response to plain ones, for files and 3DGS viewers."""
+"""Convert Gaussians of another pixel response to plain Gaussians, for files and 3DGS viewers."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,9 +10,9 @@ from crossgrad_backbones.visibility import columns_of, depths_in_view, finest_pi
 from crossgrad_core.numerics.rotations import rotation_matrices
 from crossgrad_core.plugin import Camera, Gaussians
 
-#: Value that viewers add to both diagonal entries of the 2-D covariance, px^2 (3DGS).
+#: Number that 3DGS viewers add to both diagonal elements of the 2-D covariance, in px^2.
 FILE_DILATION = 0.3
-#: A reduced variance keeps at least this share of its value.
+#: After a subtraction, a variance keeps at least this share of its value.
 FLOOR = 1e-4
 
 
@@ -20,24 +20,25 @@ FLOOR = 1e-4
 def as_plain(
     gaussians: Gaussians, cameras: Sequence[Camera], blur: float, near: float
 ) -> Gaussians:
-    """Convert Gaussians so that plain rendering and their own response give the same image.
+    """Convert the Gaussians of Mip-Splatting such that a plain 3DGS render gives the same image.
 
-    A response adds the variance `blur` to the 2-D covariance S and preserves the volume, that is
-    opacity times sqrt(det S). A viewer's dilation is larger than `blur`. Therefore the difference
-    between the dilation and `blur` is first subtracted from the 3-D variances. At depth z, a pixel
-    is z / f local units wide. With S' for the reduced S, the opacity is multiplied by sqrt(det S /
-    det(S' + dilation)), the ratio of footprints.
+    The response adds the variance `blur` to the 2-D covariance S, and keeps opacity times sqrt(det
+    S) constant. A 3DGS viewer adds a larger variance, the dilation. The difference between the
+    dilation of the viewer and `blur` is therefore first subtracted from the 3-D variances. For the
+    subtraction, a pixel at depth z has the width z / f in local units, with the focal length f. S'
+    is the 2-D covariance after the subtraction. The opacity is multiplied by sqrt(det S / det(S' +
+    dilation)), the ratio of the footprints.
 
-    The 3-D variances are computed for the camera with the finest pixels at a Gaussian. The opacity
-    is computed for the camera with the largest ratio. With means over the cameras instead, a
-    Gaussian near some cameras and far from others would be too thin and too faint. A Gaussian that
-    no camera sees is unchanged.
+    The 3-D variances are computed for the camera with the smallest pixels at the Gaussian. The
+    opacity is computed for the camera with the largest ratio. If means over the cameras were used
+    instead, a Gaussian near some cameras and far from other cameras would be too thin and too
+    faint. A Gaussian that no camera sees is unchanged.
 
     Args:
-        gaussians: Gaussians of another response.
-        cameras: The cameras, at least one.
-        blur: px^2.
-        near: Near plane, local units.
+        gaussians: Gaussians with another pixel response.
+        cameras: The cameras; at least one is required.
+        blur: Variance that the response adds, in px^2.
+        near: Depth of the near plane in local units.
     """
     means, scales = gaussians.means.double(), gaussians.scales.double()
     pixels = finest_pixels(means, cameras, near)
@@ -62,7 +63,13 @@ def as_plain(
 
 
 def _projected(axes: Tensor, means: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Return pixels right and down [N, 3] per local unit along the main axes [N, 3, 3]."""
+    """Return the horizontal and vertical image components [N, 3] of the axes, in px per local unit.
+
+    Args:
+        axes: [N, 3, 3] main axes of the Gaussians as unit vectors, one axis per column.
+        means: [N, 3] centres of the Gaussians.
+        camera: The camera. Its projection is linearised at the centres.
+    """
     pose = camera.world_to_camera.to(means, non_blocking=True)
     x, y, z = (means @ pose[:3, :3].T + pose[:3, 3])[:, :, None].unbind(1)
     row_u = camera.fx / z * (pose[0, :3] - x / z * pose[2, :3])
@@ -71,7 +78,10 @@ def _projected(axes: Tensor, means: Tensor, camera: Camera) -> tuple[Tensor, Ten
 
 
 def _determinant(u: Tensor, v: Tensor, scales: Tensor, dilation: float) -> Tensor:
-    """Return determinants [N] of the 2-D covariance with `dilation` on its diagonal, px^4."""
+    """Return the determinants [N] of the 2-D covariances, in px^4.
+
+    `dilation` is added to the diagonals of the covariances.
+    """
     u, v = u * scales, v * scales
     trace = u.square().sum(1) + v.square().sum(1)
     det: Tensor = torch.linalg.cross(u, v).square().sum(1) + dilation * trace + dilation**2

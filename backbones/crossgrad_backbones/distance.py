@@ -1,4 +1,4 @@
-"""A backbone that extends vanilla by attributes that depend on the camera distance."""
+"""A backbone that extends `vanilla` by attributes that depend on the camera distance."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -25,21 +25,23 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: Minimum distance in local units. Without it, a camera at the mean centre would have no
-#: logarithmic distance.
+#: Smallest camera distance, in local units. Without this limit, the logarithm would be infinite for
+#: a camera at the mean centre.
 NEAREST = 1e-3
-#: All distances count as equal if the standard deviation of their logarithms is below this value.
+#: All camera distances count as equal if the standard deviation of their logarithms is below this
+#: value.
 LEAST_SPREAD = 1e-6
 
 
 @dataclass(frozen=True)
 class Conditioned:
-    """A tensor of the vanilla backbone that depends on the camera distance.
+    """A tensor of `vanilla` that depends on the camera distance.
 
     Attributes:
-        weights: Name of the tensor of weights [N, ..., 2].
-        base: The block to which the weighted terms are added.
-        shape: Shape of a primitive's weights; the product with D broadcasts to the base's shape.
+        weights: Name of the tensor that contains the weights [N, ..., 2].
+        base: Name of the block to which the weighted terms are added.
+        shape: Shape of the weights of one primitive. The product of the weights with D = (z, z^2)
+            broadcasts to the shape of the base.
     """
 
     weights: str
@@ -53,9 +55,13 @@ COLORS = Conditioned("distance_f_dc", "f_dc", (1, 3, 2))
 
 
 def fitted_scale(cameras: Sequence[Camera]) -> Tensor:
-    """Return [7] float64: mean centre, mean and 1 / standard deviation of log r, range of z.
+    """Return [7] float64 with statistics of the camera distances.
 
-    The last three values are 0 if there is one camera or if all distances are equal.
+    The values are the mean camera centre [3], mean and 1 / standard deviation of log r, and
+    smallest and largest z. Here r is the distance of a camera from the mean centre, and z is the
+    standardised log r.
+
+    The last three values are 0 if only one camera exists or all distances are equal.
     """
     centers = torch.stack([camera.center for camera in cameras])
     middle = centers.mean(0)
@@ -67,15 +73,15 @@ def fitted_scale(cameras: Sequence[Camera]) -> Tensor:
 
 
 def distinguished(scale: Tensor) -> bool:
-    """Return True if the distances behind a result of `fitted_scale` differ."""
+    """Return True if the camera distances differ. `scale` is a result of `fitted_scale`."""
     return bool(scale[4] > 0)
 
 
 def encoded(scale: Tensor, cameras: Sequence[Camera]) -> Tensor:
-    """Return the encoding D = (z, z^2) [2], averaged over the cameras.
+    """Return the mean of D = (z, z^2) [2] over the cameras.
 
-    z is the standardised log r of a camera, clamped to the range of the training cameras, because a
-    quadratic does not extrapolate.
+    z is the standardised log distance of a camera. z is limited to the range of the training
+    cameras, because a quadratic function does not extrapolate well.
     """
     centers = torch.stack([camera.center for camera in cameras]).to(scale, non_blocking=True)
     z = (_log_distances(centers, scale[:3]) - scale[3]) * scale[4]
@@ -84,20 +90,20 @@ def encoded(scale: Tensor, cameras: Sequence[Camera]) -> Tensor:
 
 
 def added(weights: Tensor, encoding: Tensor) -> Tensor:
-    """Return the terms [N, ...] that weights [N, ..., 2] add for an encoding [2].
+    """Return the terms [N, ...] that the weights [N, ..., 2] add for an encoding D [2].
 
-    The code avoids a matrix product, because the rounding of a matrix product depends on the number
-    of threads.
+    A matrix product is avoided, because its rounding depends on the number of threads.
     """
     products: Tensor = weights * encoding
     return products.sum(-1)
 
 
 def largest_addition(scale: Tensor, weights: Tensor) -> Tensor:
-    """Return the maximum [N] of w_1 z + w_2 z^2 for weights [N, 2] within the range of z."""
+    """Return the maximum [N] of w_1 z + w_2 z^2 over the range of z, for weights [N, 2]."""
     first, second = weights.unbind(1)
     least, most = scale[5:].to(weights)
-    # The maximum of a parabola is at an end of the range, or at its vertex if it opens downwards.
+    # The maximum of a parabola is at an end of the range or, if the parabola opens downwards, at
+    # its vertex.
     vertex = torch.where(second < 0, -first / (2 * second), least)
     vertex = torch.minimum(torch.maximum(vertex, least), most)
     sums: Tensor = torch.stack([z * first + z * z * second for z in (least, vertex, most)])
@@ -105,11 +111,11 @@ def largest_addition(scale: Tensor, weights: Tensor) -> Tensor:
 
 
 def penalty(weights: Tensor, l2: float, smoothness: float) -> Tensor:
-    """Compute the penalty on weights [N, ..., 2]: sum per Gaussian, mean over the Gaussians.
+    """Return the penalty on the weights [N, ..., 2]: the sum for each Gaussian, then the mean.
 
-    The penalty is `l2` times the squared weights, plus `smoothness` times the squared derivative of
-    w_1 z + w_2 z^2 with respect to z, averaged over the training cameras. Over these cameras z has
-    mean 0 and variance 1, so the mean of (w_1 + 2 w_2 z)^2 is w_1^2 + 4 w_2^2.
+    The penalty is `l2` times the squared weights, plus `smoothness` times the mean squared
+    derivative of w_1 z + w_2 z^2 with respect to z. Over the training cameras, z has mean 0 and
+    variance 1. The mean of (w_1 + 2 w_2 z)^2 is therefore w_1^2 + 4 w_2^2.
     """
     factors = torch.tensor([l2 + smoothness, l2 + 4 * smoothness]).to(weights, non_blocking=True)
     total: Tensor = (weights.square() @ factors).sum()
@@ -121,22 +127,23 @@ def _log_distances(centers: Tensor, middle: Tensor) -> Tensor:
     return distances.clamp(min=NEAREST).log()
 
 
-#: Name of the tensor that `fitted_scale` returns.
+#: Name of the tensor that contains the result of `fitted_scale`.
 SCALE = "distances"
 
 
 class DistanceConditioned(Vanilla):
-    """The 3DGS representation with scales, opacities and colours linear in D = (z, z^2).
+    """The 3DGS representation with scales, opacities and colours that are linear in D = (z, z^2).
 
-    z is the logarithm of the camera's distance from the mean training camera, standardised. Each
-    Gaussian adds w . D to its log scales (the same term for all three scales), to its opacity logit
-    and to each coefficient of SH band 0, with separate weights w for each of them. The weights
-    start at 0, so that the model equals vanilla bit for bit. Two penalties on the weights grow
-    linearly over the run: their squared length, and the squared derivative, with respect to z, of
-    the terms that the weights add. Blocks: the blocks of vanilla, `distance_scales` [N, 1, 2],
-    `distance_opacities` [N, 2], `distance_f_dc` [N, 1, 3, 2], and `distances` [7]. Source: the
-    paper, Distance-Conditioned Attributes; the encoding and the default values were chosen for
-    crossgrad.
+    z is the standardised logarithm of the camera's distance from the mean of the training cameras.
+    Each Gaussian has weights w, and the dot product of w and D is added to each attribute below.
+    The attributes are the log scales (with a common term for all three), the opacity logit, and
+    each coefficient of SH degree 0. Each attribute has its own weights. All weights start at 0, so
+    that the initial model is bit-identical to `vanilla`. Two penalties on the weights increase
+    linearly during the run: their squared length, and the squared derivative of the added terms
+    with respect to z. Blocks: the blocks of `vanilla`, `distance_scales` [N, 1, 2],
+    `distance_opacities` [N, 2], `distance_f_dc` [N, 1, 3, 2], and `distances` [7]. Source: arXiv
+    2605.00052, Distance-Conditioned Attributes. crossgrad chose the encoding and the default
+    values.
     """
 
     plain: ClassVar[bool] = False
@@ -158,7 +165,8 @@ class DistanceConditioned(Vanilla):
     smoothness_weight: float = Field(
         0.01,
         ge=0,
-        description="final weight of the mean squared derivative by the log distance in the loss",
+        description="final weight in the loss of the mean squared derivative with respect to the "
+        "log distance",
     )
 
     @override
@@ -189,7 +197,7 @@ class DistanceConditioned(Vanilla):
 
     @override
     def fitted_to(self, scene: Scene) -> tuple[Vanilla, tuple[str, ...]]:
-        """Leave out the distance terms if all training cameras are equally far away."""
+        """Leave out the distance terms if all training cameras have the same distance."""
         backbone, notes = super().fitted_to(scene)
         if distinguished(_scale_of(scene)):
             return backbone, notes
@@ -226,7 +234,7 @@ class DistanceConditioned(Vanilla):
     def _seen_from(
         self, parameters: Mapping[str, Tensor], cameras: Sequence[Camera]
     ) -> dict[str, Tensor]:
-        """Return the parameters of vanilla for the mean encoding of these cameras."""
+        """Return the parameters of `vanilla` for the mean encoding of the cameras."""
         encoding = encoded(parameters[SCALE], cameras).to(parameters["means"])
         sums = {
             conditioned.base: parameters[conditioned.base]
@@ -237,7 +245,7 @@ class DistanceConditioned(Vanilla):
 
     @hookimpl
     def crossgrad_regularize(self, context: RegularizeContext) -> RegularizeResult | None:
-        """Return both penalties on the weights, once per step."""
+        """Return the sum of both penalties on the weights, once in each step."""
         names = [conditioned.weights for conditioned in self._conditioned()]
         if context.gaussians is not None or not names:
             return None
@@ -251,7 +259,7 @@ class DistanceConditioned(Vanilla):
 
     @override
     def capped_opacities(self, parameters: Mapping[str, Tensor], cap: float) -> Tensor:
-        """Cap the opacity at the distance of its maximum."""
+        """Limit the opacity at the camera distance for which the opacity is largest."""
         if not self.condition_opacities:
             return super().capped_opacities(parameters, cap)
         most = largest_addition(parameters[SCALE], parameters[OPACITIES.weights].detach())

@@ -32,24 +32,26 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: Variance of the filter in squared pixels. The pixels are those of the camera with the finest
-#: pixels at a Gaussian.
+#: Variance of the 3-D filter in squared pixels. The pixel size is taken from the camera that has
+#: the smallest pixels at the Gaussian.
 VARIANCE = 0.2
 
 
 @torch.no_grad()
 def filter_widths(means: Tensor, cameras: Sequence[Camera], near: float, *, parity: bool) -> Tensor:
-    """Return the standard deviation [N] of each Gaussian's filter, local units.
+    """Return the standard deviation [N] of each Gaussian's 3-D filter, in local units.
 
-    The value is sqrt(VARIANCE) z / f, the minimum over the cameras that see the mean. Gaussians
-    that no camera sees get the largest width of the seen Gaussians (0 if no Gaussian is seen).
+    The standard deviation is sqrt(VARIANCE) times the smallest z / f over all cameras that see the
+    mean, with depth z and focal length f. Gaussians that no camera sees get the largest value of
+    all other Gaussians, or 0 if no Gaussian is seen.
 
     Args:
-        means: [N, 3] local units.
+        means: [N, 3] means in local units.
         cameras: The training cameras.
-        near: Near plane, local units.
-        parity: Divide the least depth by the longest focal length of all cameras, as the published
-            code does, even if that camera does not see the Gaussian.
+        near: Depth of the near plane in local units.
+        parity: True to divide the smallest depth by the longest focal length of all cameras, as in
+            the published code. The camera with the longest focal length may not even see the
+            Gaussian.
     """
     focal = max(camera.fx for camera in cameras) if parity else None
     finest = finest_pixels(means, cameras, near, focal)
@@ -59,28 +61,36 @@ def filter_widths(means: Tensor, cameras: Sequence[Camera], near: float, *, pari
 
 
 def kept_opacity(log_scales: Tensor, widths: Tensor) -> Tensor:
-    """Return the filter's opacity factor [N] for log scales [N, 3] and widths [N], detached."""
+    """Return the factor [N] by which the filter reduces opacities.
+
+    The factor is detached from autograd.
+    """
     scales, filters = _finite_scales(log_scales.detach()), _per_axis(widths)
     return (scales / torch.hypot(scales, filters)).prod(1)
 
 
 def smoothed(log_scales: Tensor, logits: Tensor, widths: Tensor) -> tuple[Tensor, Tensor]:
-    """Return scales sqrt(s^2 + w^2) [N, 3], opacities o sqrt(prod s^2 / prod (s^2 + w^2)) [N].
+    """Return the filtered scales sqrt(s^2 + w^2) [N, 3] and the filtered opacities [N].
 
-    The opacity factor is computed from ratios of lengths, which do not overflow or underflow before
-    their product does. The backward pass is hand-written, because autograd takes twice as long.
+    The opacity factor sqrt(prod s^2 / prod (s^2 + w^2)) is computed from quotients, so that no
+    intermediate result overflows or underflows. The backward pass is written by hand, because
+    autograd would take twice as long.
 
     Args:
-        log_scales: [N, 3] logarithms of s.
-        logits: [N] logits of o.
-        widths: [N] standard deviations w; they get no gradient.
+        log_scales: [N, 3] logarithms of the scales s.
+        logits: [N] logits of the opacities.
+        widths: [N] standard deviations w of the filter. The widths receive no gradient.
     """
     scales_and_opacities: tuple[Tensor, Tensor] = _Smoothed.apply(log_scales, logits, widths)  # type: ignore[no-untyped-call]
     return scales_and_opacities
 
 
 class _Smoothed(torch.autograd.Function):
-    """With S = hypot(s, w), k = s / S: dS/d(log s) = S k^2, d(log prod k)/d(log s) = (w / S)^2."""
+    """The 3-D filter with its backward pass.
+
+    With S = hypot(s, w) and k = s / S, the derivatives are dS/d(log s) = S k^2 and d(log prod
+    k)/d(log s) = (w / S)^2.
+    """
 
     @staticmethod
     @override
@@ -90,7 +100,7 @@ class _Smoothed(torch.autograd.Function):
         kept = scales.div_(smooth)
         opacities = sigmoid(logits)
         drawn = opacities * kept.prod(1)
-        # Compute in place, because allocating memory of this size takes longer than the arithmetic.
+        # Compute in place, because allocating memory takes longer than the arithmetic.
         shares = kept.square_(), filters.div_(smooth).square_()
         ctx.save_for_backward(smooth, *shares, opacities, drawn)
         return smooth, drawn
@@ -106,26 +116,34 @@ class _Smoothed(torch.autograd.Function):
 
 
 def _finite_scales(log_scales: Tensor) -> Tensor:
-    """Return exp, clamped to the range of the number type so that every quotient is defined."""
+    """Return exp(log_scales), limited to the range of the floating-point type.
+
+    With finite scales, every quotient of scales is defined.
+    """
     limits = torch.finfo(log_scales.dtype)
     return log_scales.exp().clamp_(limits.tiny, limits.max)
 
 
 def _per_axis(values: Tensor) -> Tensor:
-    """Repeat to a contiguous [N, 3]: element-wise work on an expanded view is slower."""
+    """Repeat each value three times, and return a contiguous array [N, 3].
+
+    Operations on an expanded view are slower.
+    """
     return values[:, None].expand(-1, 3).contiguous()
 
 
-#: Dilation of the 2-D mip filter, px^2.
+#: Dilation of the 2-D mip filter in px^2.
 DILATION = 0.1
 
 
 class MipSplatting(Vanilla):
-    """The 3DGS representation with a filter, so that no Gaussian is finer than the photos resolve.
+    """The 3DGS representation with a 3-D filter.
 
-    Blocks: the blocks of vanilla, and `filter` [N], the standard deviation of each Gaussian's 3-D
-    filter, which is derived from the training cameras and has no gradient. Density control uses the
-    raw scales and opacities. Source: Mip-Splatting, methods of section 4.
+    No Gaussian can be smaller than the photos resolve.
+
+    Blocks: the blocks of `vanilla`, and `filter` [N]. The filter is the standard deviation of each
+    Gaussian's 3-D filter. The filter is computed from the training cameras and not trained. Density
+    control uses the scales and opacities before filtering. Source: Mip-Splatting (Yu et al. 2024).
     """
 
     response: ClassVar[Response] = "antialiased"
@@ -165,7 +183,7 @@ class MipSplatting(Vanilla):
 
     @hookimpl
     def crossgrad_after_step(self, context: AfterStepContext) -> DensifyResult | None:
-        """Recompute the filter after steps without an edit."""
+        """Compute the filter again in the steps without an edit that `renews` chooses."""
         if context.edited or not renews(context.schedule, context.step):
             return None
         widths = self._widths(context.parameters, context.scene)
@@ -186,9 +204,10 @@ class MipSplatting(Vanilla):
 
     @override
     def capped_opacities(self, parameters: Mapping[str, Tensor], cap: float) -> Tensor:
-        """Cap the filtered opacity, then divide by the filter's factor to get the stored value."""
+        """Limit the filtered opacity, and convert the limit to the opacity before filtering."""
         kept = kept_opacity(parameters["scales"], parameters["filter"])
-        # If even an opacity of 1 stays below the cap, the logit is infinite, which means no limit.
+        # If even a stored opacity of 1 stays below the limit, the logit is infinite, which means no
+        # limit.
         limit = torch.logit((cap / kept).clamp(max=1.0))
         return torch.minimum(parameters["opacities"].detach(), limit)
 
@@ -204,10 +223,10 @@ class MipSplatting(Vanilla):
 
 
 def renews(schedule: Schedule, step: int) -> bool:
-    """Return True if the filter is recomputed after a step without an edit.
+    """Return True if the filter is computed again after a step without an edit.
 
-    As published, it is recomputed every 100 of 30,000 steps between the end of density control and
-    100 steps before the end.
+    As published, the filter is computed again every 100 of 30,000 steps, from the end of density
+    control until 100 steps before the end of the run.
     """
     every = max(1, schedule.lr_until // 300)
     last = schedule.counted(schedule.total) - every

@@ -1,21 +1,21 @@
-"""Initial scales from distances to nearest neighbours."""
+"""Compute initial scales from the distances to nearest neighbours."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-#: Floor of the mean squared neighbour distance (3DGS), in squared local units.
+#: Smallest mean squared distance to neighbours (3DGS), in squared local units.
 SQUARED_DISTANCE_FLOOR = 1e-7
 
 
 def nearest_neighbour_scales(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the isotropic initial scale of each point (3DGS, section 5.1).
+    """Return the initial scale of each point, equal for all axes (3DGS, section 5.1).
 
     Args:
-        points: [P, 3].
+        points: [P, 3] points in local units.
 
     Returns:
-        [P] square root of the mean squared distance to the 3 nearest other points (all other points
-        if there are fewer), with a floor so that duplicates get a size too.
+        [P] square root of the mean squared distance to the three nearest other points, or to fewer
+        points if the cloud is smaller. A lower limit gives duplicate points a size, too.
     """
     from scipy.spatial import cKDTree
 

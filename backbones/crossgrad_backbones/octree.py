@@ -1,4 +1,4 @@
-"""Octree-GS: neural Gaussians on anchors of several levels of detail (Ren et al. 2024)."""
+"""Octree-GS: neural Gaussians of anchors on several levels of detail (Ren et al. 2024)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -29,10 +29,12 @@ from crossgrad_core.plugin import (
 
 
 def opening_steps(span: float, count: int, factor: float) -> tuple[float, ...]:
-    """Return the steps at which `count` further levels open; the last level opens at `span`.
+    """Return the steps at which `count` further levels are opened for training.
 
-    The time between two openings shrinks by `factor`: a geometric series with the first term span
-    (1 - q) / (1 - q^count), q = 1 / factor.
+    The last level is opened at step `span`.
+
+    The time between two openings is divided by `factor` each time. The times form a geometric
+    series with the first term span (1 - q) / (1 - q^count) and q = 1 / factor.
     """
     q = 1.0 / factor
     terms = [q**i for i in range(count)]
@@ -41,18 +43,18 @@ def opening_steps(span: float, count: int, factor: float) -> tuple[float, ...]:
 
 
 def allowed_top(step: int, openings: tuple[float, ...], initial: int) -> int:
-    """Return the finest level that may be trained at a step."""
+    """Return the finest level that is open for training at a step."""
     return initial + sum(step >= opening for opening in openings)
 
 
 @dataclass(frozen=True, eq=False)
 class Planted:
-    """Anchors of all levels, level by level.
+    """Initial anchors of all levels, sorted by level.
 
     Attributes:
-        positions: [A, 3] float64, local units.
-        levels: [A] int64.
-        spacings: [A] float64, initial scale of each anchor, local units.
+        positions: [A, 3] float64 positions in local units.
+        levels: [A] int64 level of each anchor.
+        spacings: [A] float64 initial scale of each anchor in local units.
     """
 
     positions: Tensor
@@ -60,23 +62,26 @@ class Planted:
     spacings: Tensor
 
     def kept(self, mask: Tensor) -> "Planted":
-        """Return the anchors selected by a mask [A]."""
+        """Return the anchors for which `mask` [A] is True."""
         return Planted(self.positions[mask], self.levels[mask], self.spacings[mask])
 
 
 def init_anchors(points: NDArray[np.float64], lattice: Lattice, *, everywhere: bool) -> Planted:
-    """Create anchors of every level: the points rounded to the level's lattice, without duplicates.
+    """Create anchors on every level.
 
-    Initial scales come from the neighbouring sites of the same level, with or without an anchor.
-    The published code uses neighbours of any level, so that coarse anchors start as small as the
-    fine anchors around them. A distant camera, which sees only coarse anchors, then sees gaps.
+    Each point is rounded to the nearest site, and duplicates are removed.
+
+    Initial scales come from the distances between sites of the same level, including sites without
+    an anchor. The published code uses distances to anchors of any level. With these distances,
+    coarse anchors start as small as neighbouring fine anchors. A distant camera uses only coarse
+    anchors. With such small Gaussians, the image of a distant camera would show gaps.
 
     Args:
-        points: [P, 3] local units.
-        lattice: The lattices.
-        everywhere: True to create an anchor at every site. False leaves out a site that contains
-            all points of its coarser site, because the site's anchor would repeat the coarser
-            anchor.
+        points: [P, 3] points in local units.
+        lattice: The lattices of all levels.
+        everywhere: True to create an anchor at every site that contains points. False leaves out
+            sites that contain all points of a coarser site, because the anchor would repeat the
+            coarser anchor.
     """
     origin = lattice.origin.numpy()
     levels = torch.arange(lattice.count)
@@ -98,42 +103,48 @@ def init_anchors(points: NDArray[np.float64], lattice: Lattice, *, everywhere: b
 
 
 def _parted(coarser: NDArray[np.int64], site: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return a mask [P]: True if the points in a point's coarser site are on several finer sites.
+    """Return a mask [P].
+
+    The mask is True if the points in the coarser site of a point are spread over several finer
+    sites.
 
     Args:
-        coarser: [P] index of each point's site on the level before.
-        site: [P] index of each point's site on this level.
+        coarser: [P] number of each point's site on the coarser level.
+        site: [P] number of each point's site on this level.
     """
     pairs = np.unique(np.stack([coarser, site], axis=1), axis=0)
     return np.bincount(pairs[:, 0])[coarser] > 1
 
 
 def visible_share(shares: Tensor, asked: float) -> float:
-    """Return the pruning threshold; an anchor stays if more than this share of the cameras sees it.
+    """Return the pruning threshold.
+
+    An anchor stays if more than this share of the cameras uses its level.
 
     Args:
-        shares: [A] share of the cameras that see the level of each anchor.
-        asked: The value of the option; a negative value selects the mean share of all anchors.
+        shares: [A] share of the cameras that use the level of each anchor.
+        asked: Value of the option `visible_threshold`. A negative value means the mean share of all
+            anchors.
     """
     return float(shares.mean()) if asked < 0.0 else asked
 
 
 Rounding = Literal["round", "floor", "ceil", "progressive"]
-#: Rounding of L* -> number of levels beyond L* that a camera sees (see `Lattice.lead`).
+#: Rounding of L* -> number of levels above L* that a camera uses (see `Lattice.lead`).
 _LEADS: Mapping[Rounding, float] = {"round": 0.5, "floor": 0.0, "ceil": 1.0, "progressive": 1.0}
 
 
 class Octree(AnchorBackbone):
-    """Anchors on nested lattices; nearer cameras use finer levels.
+    """Anchors on nested lattices. Nearer cameras use finer levels.
 
-    Octree-GS differs from Scaffold-GS in the initial anchors and in the anchors that a camera uses.
-    A camera uses anchors whose level is at most L* = log_fork(D / distance) + extra level, rounded.
-    D is about the largest distance between a camera and a point. In the first quarter of a run,
-    fine levels open one after another.
+    Octree-GS differs from Scaffold-GS in the initial anchors, and in the anchors that a camera
+    uses. A camera uses anchors whose level is at most L* = log_fork(D / distance) + extra level,
+    after rounding. D is about the largest distance between a camera and a point. During the first
+    quarter of a run, fine levels are opened for training one after another.
 
-    Further blocks, all frozen: levels [P] int64; extra_levels [P]; lattice [9] float64 (see
-    `Lattice`). Learning rates decay over the run as in Scaffold-GS. Source: Octree-GS
-    (Ren et al. 2024); methods of section 6.
+    Additional blocks, all frozen: levels [P] int64; extra_levels [P]; lattice [9] float64 (see
+    `Lattice`). Learning rates decay over the run, as in Scaffold-GS. Source: Octree-GS (Ren et al.
+    2024).
     """
 
     default_densifier: ClassVar[str] = "octree"
@@ -198,7 +209,7 @@ class Octree(AnchorBackbone):
 
     @override
     def fitted_to(self, scene: Scene) -> tuple["Octree", tuple[str, ...]]:
-        """Add a note that anchors which repeat a coarser anchor are left out."""
+        """Return a note if anchors that repeat a coarser anchor are left out."""
         if self.plant_everywhere:
             return self, ()
         note = (
@@ -251,7 +262,7 @@ class Octree(AnchorBackbone):
         return Used(mask, lattice.faded(distances, levels, extra))
 
     def _top(self, parameters: Mapping[str, Tensor], phase: Phase) -> int | None:
-        """Return the finest open level; None if all levels are open."""
+        """Return the finest level that is open for training. Return None if all levels are open."""
         span = phase.schedule.coarse_until
         if not (self.progressive and phase.training and phase.count < span):
             return None
@@ -264,7 +275,7 @@ class Octree(AnchorBackbone):
     def bake(
         self, parameters: Mapping[str, Tensor], phase: Phase, cameras: Sequence[Camera]
     ) -> Gaussians:
-        """Bake like the base class, but omit anchors whose level no camera uses."""
+        """Bake as the base class does, but leave out anchors whose level no camera uses."""
         used = torch.stack([self.used(parameters, c, phase).mask for c in cameras]).any(0)
         names = {name for block in self.blocks() if block.per_primitive for name in block.tensors}
         rows = {n: t[used] if n in names else t for n, t in parameters.items()}

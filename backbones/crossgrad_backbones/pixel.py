@@ -1,4 +1,4 @@
-"""Pixel-GS: the Gaussians of 3DGS with density control that counts pixels (Zhang et al. 2024)."""
+"""Pixel-GS: 3DGS whose density control weights gradients by pixels (Zhang et al. 2024)."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -7,9 +7,9 @@ from crossgrad_backbones.vanilla import Vanilla
 
 
 class PixelGS(Vanilla):
-    """The 3DGS representation with the densifier `pixel` by default.
+    """The 3DGS representation, with `pixel` as the default densifier.
 
-    Source: Pixel-GS, which changes only the densification statistic.
+    Source: Pixel-GS, which changes only the statistic for densification.
     """
 
     default_densifier: ClassVar[str] = "pixel"

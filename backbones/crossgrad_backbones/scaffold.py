@@ -14,7 +14,7 @@ from crossgrad_core.plugin import Camera, Parameters, Phase, Scene
 
 
 class Scaffold(AnchorBackbone):
-    """Anchors in the voxels that contain SfM points; a camera uses all anchors in its frustum."""
+    """Anchors in all voxels that contain SfM points. A camera uses all anchors in its frustum."""
 
     voxel_size: float | None = Field(
         None,

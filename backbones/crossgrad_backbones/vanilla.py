@@ -1,4 +1,4 @@
-"""Vanilla 3DGS: one explicit Gaussian per primitive (Kerbl et al. 2023)."""
+"""Vanilla 3DGS: each primitive is an explicit Gaussian (Kerbl et al. 2023)."""
 
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
@@ -27,10 +27,10 @@ from crossgrad_core.plugin import (
 
 
 class Vanilla(Backbone):
-    """The 3DGS representation with its published learning rates.
+    """The 3DGS representation with the published learning rates.
 
-    Blocks: means [N, 3]; scales [N, 3] (log); quats [N, 4] wxyz; opacities [N] (logit);
-    f_dc [N, 1, 3]; f_rest [N, 15, 3]. Source: 3DGS, methods of section 5.
+    Blocks: means [N, 3]; scales [N, 3] (logarithms); quats [N, 4] (w, x, y, z); opacities [N]
+    (logits); f_dc [N, 1, 3]; f_rest [N, 15, 3]. Source: 3DGS (Kerbl et al. 2023).
     """
 
     plain: ClassVar[bool] = True
@@ -53,7 +53,7 @@ class Vanilla(Backbone):
     lr_f_rest: float = Field(2.5e-3 / 20, ge=0, description="learning rate of the higher SH bands")
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """Return the options without an effect; see `HasUnusedOptions`."""
+        """Return the options that have no effect (see `HasUnusedOptions`)."""
         if self.sh_degree > 0:
             return {}
         return {"lr_f_rest": "there are no higher SH bands (sh_degree = 0); leave the option out"}
@@ -74,7 +74,7 @@ class Vanilla(Backbone):
         return (*rows, rest)
 
     def _scales_lr(self) -> LearningRate:
-        # This factor was measured for crossgrad (docs/schedules.md).
+        # The factor 2 for runs with few passes was measured for crossgrad (docs/schedules.md).
         return LearningRate(self.lr_scales, few_passes=2.0)
 
     def _means_lr(self) -> LearningRate:
@@ -82,10 +82,11 @@ class Vanilla(Backbone):
 
     @override
     def fitted_to(self, scene: Scene) -> tuple["Vanilla", tuple[str, ...]]:
-        """Leave out spherical-harmonics bands that the number of views cannot support.
+        """Leave out spherical harmonics of high degree if the scene has too few training views.
 
-        A Gaussian is seen from at most as many directions as there are training views. A band can
-        improve the result only if there are at least as many views as coefficients.
+        A Gaussian is seen from at most as many directions as there are training views. A higher
+        degree can improve the result only if the scene has at least as many views as the degree has
+        coefficients.
         """
         if "sh_degree" in self.model_fields_set:
             return self, ()
@@ -118,7 +119,7 @@ class Vanilla(Backbone):
         return self._with_rest(tensors, count)
 
     def _first_opacities(self, scene: Scene) -> NDArray[np.float64]:
-        """Return the initial opacity logits [P]."""
+        """Return the initial opacities [P] as logits."""
         opacities = np.full(len(scene.points), self.initial_opacity)
         if scene.point_opacities is not None:
             has_opacity = ~np.isnan(scene.point_opacities)
@@ -158,7 +159,10 @@ class Vanilla(Backbone):
         return self.splats(parameters, phase.schedule.sh_degree(phase.step, self.sh_degree))
 
     def splats(self, parameters: Mapping[str, Tensor], degree: int) -> Gaussians:
-        """Return the Gaussians with spherical harmonics up to `degree`, differentiable."""
+        """Return the Gaussians with spherical harmonics up to `degree`.
+
+        The Gaussians are differentiable with respect to the parameters.
+        """
         return Gaussians(
             means=parameters["means"],
             quats=parameters["quats"],
@@ -177,7 +181,10 @@ class Vanilla(Backbone):
 
 
 def _sizes(scene: Scene) -> NDArray[np.float64]:
-    """Return initial standard deviations [P]; points of known size do not count as neighbours."""
+    """Return the initial standard deviations [P].
+
+    Points with known sizes do not count as neighbours.
+    """
     if scene.point_sizes is None:
         return nearest_neighbour_scales(scene.points)
     sizes = scene.point_sizes.copy()

@@ -1,4 +1,4 @@
-"""Visibility of Gaussians by their centres, and the size of a pixel at each centre."""
+"""Test whether cameras see the centres of Gaussians, and compute pixel sizes at the centres."""
 
 from collections.abc import Sequence
 
@@ -7,16 +7,16 @@ from torch import Tensor
 
 from crossgrad_core.plugin import Camera
 
-#: A centre counts as seen if it is inside the enlarged image. The image is enlarged by this share
-#: of its size on each side.
+#: A centre counts as seen if the centre is inside the image plus a margin. The margin on each side
+#: is this share of the image size.
 MARGIN = 0.15
-#: Minimum distance in local units of a centre from the camera that sees it. It is the default of
-#: the rasterizers.
+#: Smallest depth of a centre that a camera sees, in local units. The value equals the default near
+#: plane of the rasterizers.
 NEAR = 1e-3
 
 
 def columns_of(means: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return x, y and z [N] of means [N, 3], each contiguous, without a graph."""
+    """Return x, y and z [N] of means [N, 3] as contiguous tensors without an autograd graph."""
     x, y, z = means.detach().T.contiguous().unbind(0)
     return x, y, z
 
@@ -24,19 +24,19 @@ def columns_of(means: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def depths_in_view(
     columns: tuple[Tensor, Tensor, Tensor], camera: Camera, near: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the camera depth of each centre, and a mask of the centres that the camera sees.
+    """Return the depth of each centre in a camera, and a mask of the centres that the camera sees.
 
     Args:
-        columns: x, y and z [N] from `columns_of`, local frame.
+        columns: x, y and z [N] in the local frame, from `columns_of`.
         camera: The camera.
-        near: Centres must be farther than this depth, local units.
+        near: Smallest depth of a visible centre, in local units.
 
     Returns:
-        Depths [N] and seen [N] bool: in front, and projected into the image enlarged by `MARGIN`
-        of its size on every side.
+        Depths [N] and a mask [N]. The mask is True for centres in front of the camera that are
+        projected into the image plus a margin of `MARGIN` times its size.
     """
     pose = camera.world_to_camera[:3]
-    # The border |f x / z + c - size / 2| <= (0.5 + MARGIN) size, multiplied by z.
+    # The condition |f x / z + c - size / 2| <= (0.5 + MARGIN) size, multiplied by z.
     half_width, half_height = ((0.5 + MARGIN) * size for size in (camera.width, camera.height))
     shift_x, shift_y = camera.cx - camera.width / 2, camera.cy - camera.height / 2
     across = _affine(columns, (camera.fx * pose[0] + shift_x * pose[2]) / half_width)
@@ -47,11 +47,11 @@ def depths_in_view(
 
 
 def _affine(columns: tuple[Tensor, Tensor, Tensor], row: Tensor) -> Tensor:
-    """Return one coordinate [N] of transformed points.
+    """Return one coordinate [N] of the transformed points.
 
-    The coordinate is computed element by element. A matrix product may round a row differently at
-    another position. The values of a primitive must not change if other primitives are added or
-    removed.
+    The coordinate is computed element by element. In a matrix product, the rounding of a row may
+    depend on its position. The values of a primitive must not change when other primitives are
+    added or removed.
     """
     x, y, z = columns
     a, b, c, d = row.tolist()
@@ -62,10 +62,12 @@ def _affine(columns: tuple[Tensor, Tensor, Tensor], row: Tensor) -> Tensor:
 def finest_pixels(
     means: Tensor, cameras: Sequence[Camera], near: float, focal: float | None = None
 ) -> Tensor:
-    """Return the least z / f [N] over the cameras that see means [N, 3], local units per pixel.
+    """Return the smallest z / f [N] over the cameras that see each mean [N, 3].
 
-    The value is infinite if no camera sees a mean. f is each camera's own fx, or `focal` for all
-    cameras.
+    The unit is local units per pixel.
+
+    The value is infinite if no camera sees a mean. z is the depth, and f is the focal length fx of
+    the camera, or `focal` for all cameras.
     """
     columns = columns_of(means)
     finest = torch.full_like(columns[0], torch.inf)

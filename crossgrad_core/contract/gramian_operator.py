@@ -38,7 +38,7 @@ class MatrixOperator(Operator):
         state: PluginState,
         rng: np.random.Generator,
     ) -> tuple[NDArray[np.float64], PluginState]:
-        """Return the matrices M for the gradients of each block.
+        """Return a matrix M for each block; M multiplies the K gradients of the block.
 
         Args:
             gramians: [B, K, K] float64, symmetric positive semi-definite up to rounding.

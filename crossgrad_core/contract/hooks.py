@@ -55,7 +55,7 @@ class HookSpecs:
 
     @hookspec
     def crossgrad_update_intervals(self, blocks: "tuple[Block, ...]") -> "Mapping[str, int] | None":
-        """Return tensor name -> N for tensors that are updated in only one of N steps.
+        """Return a dict from tensor name to N, for tensors that are updated in one of N steps.
 
         All plugins answer this hook, once per run. In the steps that update such a tensor, its
         learning rate is multiplied by sqrt(N).

@@ -118,7 +118,10 @@ def sums(context: DensifyContext, state: PluginState, names: Sequence[str]) -> d
 
 
 def add(record: RenderedView, total: Tensor, values: Tensor, rows: Tensor | None = None) -> None:
-    """Add the values [N] of all Gaussians, or of those in `rows`, to the primitives' sums [P]."""
+    """Add values [N] of Gaussians to the sums `total` [P] of their primitives.
+
+    `rows` contains the rows of the Gaussians; None means all Gaussians.
+    """
     origin = record.gaussians.origin
     if origin is not None:
         total.index_add_(0, origin if rows is None else origin.index_select(0, rows), values)

@@ -1,6 +1,7 @@
-"""Columns of gradients: float32 on the CPU uses compiled passes, everything else uses torch.
+"""Columns of gradients: compiled kernels process float32 on the CPU, torch all other gradients.
 
-A *column* is the list of the K gradients of one tensor; None if a view does not touch the tensor.
+A *column* is the list of the K views' gradients of one tensor. An entry is None if the view does
+not touch the tensor.
 """
 
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ Column: TypeAlias = Sequence[Tensor | None]
 
 
 def is_native(column: Column) -> bool:
-    """Return True if the compiled passes support the column."""
+    """Return True if the compiled kernels support all gradients of the column."""
     for gradient in column:
         if gradient is not None and (gradient.dtype != torch.float32 or not gradient.is_cpu):
             return False
@@ -21,6 +22,9 @@ def is_native(column: Column) -> bool:
 
 
 def unit_roundoff(columns: Sequence[Column]) -> float:
-    """Return the smallest unit roundoff of the gradients' types; 2^-24 without gradients."""
+    """Return the smallest unit roundoff of the gradients' types.
+
+    Without gradients, return 2^-24 (float32).
+    """
     types = {gradient.dtype for column in columns for gradient in column if gradient is not None}
     return min(torch.finfo(kind).eps / 2 for kind in types or {torch.float32})

@@ -1,7 +1,9 @@
-"""The running sum of the gradients of K views on a GPU; the host waits only when the sum is read.
+"""The running sum of the gradients of K views on a GPU.
 
-`SummedGradients` checks the gradients of each view when they are added. On a GPU, these checks
-would make the host wait K times for each tensor.
+The CPU waits for the GPU only when the sum is read.
+
+In contrast, `SummedGradients` checks the gradients of each view in `add`. On a GPU, these checks
+would make the CPU wait K times for each tensor.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,15 +21,17 @@ from crossgrad_core.gradients.finite import largest
 
 
 class DeferredSums(Gradients):
-    """The sum of K views' gradients in the order of the views; single views are not kept.
+    """The sum of the gradients of K views, added in the order of the views.
 
-    Gradients that are not finite are left out on the device. `finite`, `present` and `total` read
-    the largest magnitudes of all views and tensors, in one transfer. The last view is added after
-    this transfer.
+    Gradients of single views are not stored.
+
+    Gradients that are not finite are left out of the sum, without a wait for the GPU. `finite`,
+    `present` and `total` read the largest magnitudes of all gradients in one transfer from the GPU.
+    The gradients of the last view are added after this transfer.
 
     Args:
-        blocks: The blocks.
-        views: K, the expected number of views.
+        blocks: The blocks of the backbone.
+        views: Expected number of views K.
     """
 
     def __init__(self, blocks: Sequence[Block], views: int) -> None:
@@ -39,10 +43,12 @@ class DeferredSums(Gradients):
         self._largest: list[dict[str, Tensor]] = []
 
     def add(self, view: Mapping[str, Tensor | None]) -> None:
-        """Add the gradients of one more view; this object then owns and overwrites them.
+        """Add the gradients of one more view.
+
+        The caller must not use these gradients any more, because `add` and `total` overwrite them.
 
         Raises:
-            RuntimeError: All expected views were already added.
+            RuntimeError: All expected views have already been added.
         """
         if len(self._largest) == self._expected:
             raise RuntimeError(
@@ -81,12 +87,15 @@ class DeferredSums(Gradients):
         return self._read[1]
 
     def _tensors_of(self, chosen: NDArray[np.bool_]) -> set[str]:
-        """Return the tensors of the chosen blocks [B]."""
+        """Return the names of all tensors in the blocks that `chosen` [B] marks as True."""
         blocks = zip(self._blocks, chosen.tolist(), strict=True)
         return {name for block, is_chosen in blocks if is_chosen for name in block.tensors}
 
     def _kept(self, name: str) -> Tensor:
-        """Return the last view's gradient of a tensor; 0 if its block is not finite."""
+        """Return the last view's gradient of a tensor.
+
+        Return zeros if a gradient in its block is not finite.
+        """
         block = next(block for block in self._blocks if name in block.tensors)
         sizes = [self._largest[-1][other] for other in block.tensors if other in self._last]
         gradient = self._last[name]
@@ -100,7 +109,11 @@ class DeferredSums(Gradients):
 
     @cached_property
     def _read(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Two arrays [B, K]: True for finite gradients, and True for finite non-zero gradients."""
+        """Two arrays [B, K] with an element for each block and view.
+
+        The first array is True for finite gradients, the second array for finite non-zero
+        gradients.
+        """
         magnitudes = [size for view in self._largest for size in view.values()]
         values = iter(torch.stack(magnitudes).tolist() if magnitudes else ())
         sizes = [{name: next(values) for name in view} for view in self._largest]

@@ -1,4 +1,4 @@
-"""Passes over gradients with torch: any device and floating-point type, in float64 pieces."""
+"""Gramians and sums of gradients with torch, in float64, for any device and floating-point type."""
 
 from collections.abc import Iterator, Sequence
 
@@ -9,13 +9,13 @@ from torch import Tensor
 
 from crossgrad_core.gradients.columns import Column
 
-#: Number of elements of K gradients that are converted to float64 at a time. Short pieces on the
-#: CPU keep the rounding errors of long float64 sums small. Long pieces are faster on a GPU.
+#: Number of elements of each gradient that are converted to float64 at a time. On the CPU, short
+#: pieces keep the rounding errors of float64 sums small. On a GPU, long pieces are faster.
 PIECE = {"cpu": 1 << 14, "cuda": 1 << 22}
 
 
 def gramian(column: Column, scale: float = 1.0) -> Tensor:
-    """Return the [K, K] float64 Gramian of `scale` times a column's gradients, on their device."""
+    """Return the [K, K] float64 Gramian of `scale` times the gradients of a column."""
     first = _any(column)
     total = first.new_zeros((len(column), len(column)), dtype=torch.float64)
     partial = [wide @ wide.T for wide in pieces(column, scale)]
@@ -23,7 +23,10 @@ def gramian(column: Column, scale: float = 1.0) -> Tensor:
 
 
 def largest(column: Column) -> Tensor:
-    """Return [K] float64, the largest magnitude of each gradient; 0 if absent or empty."""
+    """Return [K] float64, the largest magnitude of each gradient.
+
+    For a missing or empty gradient, the result is 0.
+    """
     first = _any(column)
     zero = first.new_zeros((), dtype=torch.float64)
     return torch.stack(
@@ -38,14 +41,16 @@ def combine(
     out: Tensor,
     divisor: float = 1.0,
 ) -> None:
-    """Write the weighted sum of a column, in float64 and rounded once, in the given order.
+    """Write the weighted sum of a column to `out`.
+
+    The sum is computed in float64 in the given order, and rounded once.
 
     Args:
-        column: K gradients; None is left out.
-        weights: [K].
-        plain: True to add without weights, in the type of the gradients.
-        out: The result; may be one of the gradients.
-        divisor: Divisor of a plain sum.
+        column: The gradients of K views; None (a missing gradient) is left out.
+        weights: [K] weight of each gradient.
+        plain: True to add the gradients without weights, in their own type.
+        out: Tensor for the result, which may be one of the gradients.
+        divisor: Number by which a plain sum is divided.
     """
     used = [
         (w, g.reshape(-1)) for w, g in zip(weights.tolist(), column, strict=True) if g is not None
@@ -68,13 +73,13 @@ def combine(
 
 
 def overlap(column: Column, first: int, second: int) -> bool:
-    """Return True if two views' gradients of a tensor have a common non-zero element."""
+    """Return True if some element of a tensor has a non-zero gradient in both views."""
     a, b = column[first], column[second]
     return a is not None and b is not None and bool(((a != 0) & (b != 0)).any())
 
 
 def row_gramians(columns: Sequence[Column], rows: int) -> NDArray[np.float64]:
-    """Return [N, K, K], the Gramians of the rows of a block's tensors."""
+    """Return [N, K, K]: for each row, the Gramian over all tensors of a block."""
     views = len(columns[0])
     total = np.zeros((rows, views, views))
     for column in columns:
@@ -86,14 +91,18 @@ def row_gramians(columns: Sequence[Column], rows: int) -> NDArray[np.float64]:
 
 
 def row_combine(column: Column, weights: NDArray[np.float64], out: Tensor) -> None:
-    """Write the row-wise weighted sum of a column; in `weights` [N, K], 0 leaves out a row."""
+    """Write the weighted sum of each row of a column.
+
+    A weight of 0 in `weights` [N, K] leaves out the row of a view.
+    """
     rows = len(weights)
     total = torch.zeros_like(out, dtype=torch.float64).view(rows, -1)
     factors = torch.from_numpy(np.ascontiguousarray(weights.T)).to(out.device, non_blocking=True)
     for w, g in zip(factors, column, strict=True):
         if g is not None:
             wide = g.reshape(rows, -1).double()
-            # Zero times infinity is NaN, so rows of weight zero are selected instead of multiplied.
+            # Zero times infinity is NaN. Rows with weight zero are therefore replaced by zeros
+            # instead of multiplied.
             total += torch.where(w[:, None] == 0, torch.zeros_like(wide), w[:, None] * wide)
     out.view(rows, -1).copy_(total)
 
@@ -101,7 +110,7 @@ def row_combine(column: Column, weights: NDArray[np.float64], out: Tensor) -> No
 def row_overlap(
     column: Column, first: int, second: int, rows: int, shared: NDArray[np.bool_]
 ) -> None:
-    """Set `shared` [N] for rows in which two views have a common non-zero element."""
+    """Set `shared` [N] to True for each row with an element that is non-zero in both views."""
     a, b = column[first], column[second]
     if a is not None and b is not None and a.numel():
         both = ((a != 0) & (b != 0)).reshape(rows, -1).any(dim=1)
@@ -113,7 +122,7 @@ def _any(column: Column) -> Tensor:
 
 
 def pieces(column: Column, scale: float) -> Iterator[Tensor]:
-    """Yield [K, L] float64 pieces of the column's gradients, times `scale`."""
+    """Yield [K, L] float64 pieces of the column's gradients, multiplied by `scale`."""
     first = _any(column)
     step = PIECE.get(first.device.type, PIECE["cpu"])
     absent = first.new_zeros((), dtype=torch.float64)
@@ -129,7 +138,7 @@ def pieces(column: Column, scale: float) -> Iterator[Tensor]:
 
 
 def row_pieces(column: Column, rows: int) -> Iterator[tuple[slice, Tensor]]:
-    """Yield row ranges with the [K, n, d] float64 gradients of their rows."""
+    """Yield ranges of rows, each with the [K, n, d] float64 gradients of its n rows."""
     first = _any(column)
     width = max(first.numel() // rows, 1)
     step = max(PIECE.get(first.device.type, PIECE["cpu"]) // width, 1)

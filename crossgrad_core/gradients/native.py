@@ -1,4 +1,4 @@
-"""Passes over float32 gradients on the CPU: all tensors of a step in one parallel kernel call."""
+"""Gramians and sums of float32 gradients on the CPU: one parallel kernel call for all tensors."""
 
 from collections.abc import Callable, Sequence
 from typing import Final
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from crossgrad_core.gradients.columns import Column
 
-#: Up to this number of elements, one core is faster than several cores.
+#: Up to this number of elements, one thread is faster than several threads.
 SMALL: Final = 1 << 17
 
 
@@ -35,7 +35,10 @@ def _size(gradient: Tensor | None) -> int:
 
 
 def gramians(columns: Sequence[Column]) -> NDArray[np.float64]:
-    """Return [T, K, K], a Gramian per column; NaN or infinite in rows of non-finite views."""
+    """Return [T, K, K], the Gramian of each column.
+
+    Entries of a view with a non-finite gradient are NaN or infinite.
+    """
     from crossgrad_core.gradients.numba_kernels import dense
 
     sizes = _sizes(columns)
@@ -47,7 +50,10 @@ def gramians(columns: Sequence[Column]) -> NDArray[np.float64]:
 
 
 def spread_gramian(column: Column, rows: Tensor, count: int) -> NDArray[np.float64]:
-    """Return the [K, K] Gramian of gradients in `rows` of `count`, bit-equal to dense gradients."""
+    """Return the [K, K] Gramian of gradients that are zero except in `rows`.
+
+    The result is bit-identical to the result for dense gradients with `count` rows.
+    """
     from crossgrad_core.gradients.numba_kernels import dense
     from crossgrad_core.numerics.jobs import parallel
 
@@ -67,14 +73,15 @@ def combine(
     out: Sequence[Tensor],
     divisor: float = 1.0,
 ) -> None:
-    """Write the weighted sum of each column, in one pass over all of its gradients.
+    """Write the weighted sum of each column to `out`, in one pass over all gradients.
 
     Args:
-        columns: T columns; None is left out.
-        weights: [T, K].
-        plain: [T], columns to add without weights in the order of the views, in float32.
-        out: T results; each may be one of its column's gradients.
-        divisor: Divisor of plain sums, in float32.
+        columns: T columns of gradients; None is left out.
+        weights: [T, K] weight of each gradient.
+        plain: [T], True for columns that are added without weights, in float32 and in the order of
+            the views.
+        out: T tensors for the results. Each output may be a gradient of its column.
+        divisor: Number by which plain sums are divided, in float32.
     """
     from crossgrad_core.gradients.numba_kernels import dense
 
@@ -86,7 +93,7 @@ def combine(
 
 
 def overlap(column: Column, first: int, second: int) -> bool:
-    """Return True if two views' gradients of a tensor have a common non-zero element."""
+    """Return True if some element of a tensor has a non-zero gradient in both views."""
     from crossgrad_core.gradients.numba_kernels import dense
 
     a, b = column[first], column[second]
@@ -96,7 +103,7 @@ def overlap(column: Column, first: int, second: int) -> bool:
 
 
 def row_gramians(columns: Sequence[Column], rows: int) -> NDArray[np.float64]:
-    """Return [N, K, K], the Gramians of the rows of a block's tensors."""
+    """Return [N, K, K]: for each row, the Gramian over all tensors of a block."""
     from crossgrad_core.gradients.numba_kernels import rows as kernels
     from crossgrad_core.numerics.jobs import parallel
 
@@ -107,7 +114,7 @@ def row_gramians(columns: Sequence[Column], rows: int) -> NDArray[np.float64]:
 
 
 def row_combine(column: Column, weights: NDArray[np.float64], out: Tensor) -> None:
-    """Write the row-wise weighted sum of a column; `weights` is [N, K]."""
+    """Write the weighted sum of each row of a column to `out`, with `weights` [N, K]."""
     from crossgrad_core.gradients.numba_kernels import rows as kernels
     from crossgrad_core.numerics.jobs import parallel
 
@@ -121,7 +128,7 @@ def row_combine(column: Column, weights: NDArray[np.float64], out: Tensor) -> No
 def row_overlap(
     column: Column, first: int, second: int, rows: int, shared: NDArray[np.bool_]
 ) -> None:
-    """Set `shared` [N] for rows in which two views have a common non-zero element."""
+    """Set `shared` [N] to True for each row with an element that is non-zero in both views."""
     from crossgrad_core.gradients.numba_kernels import rows as kernels
 
     a, b = column[first], column[second]

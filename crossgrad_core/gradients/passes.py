@@ -1,4 +1,4 @@
-"""Gramians of any mixture of gradient columns, and their rounding errors in float64."""
+"""Gramians of columns with gradients of any type and device, and their float64 rounding errors."""
 
 from collections.abc import Sequence
 from typing import Final, Protocol
@@ -11,16 +11,16 @@ from torch import Tensor
 from crossgrad_core.gradients import generic, native
 from crossgrad_core.gradients.columns import Column, is_native
 
-#: Range of magnitudes. If float64 gradients are in this range, their squares and products stay
-#: inside float64.
+#: A range of magnitudes. If float64 gradients are in this range, their squares and products neither
+#: overflow nor underflow.
 SAFE: Final = (1e-140, 1e140)
 
 
 class Passes(Protocol):
-    """The passes over single columns that `native` and `generic` implement."""
+    """The functions for single columns that both `native` and `generic` implement."""
 
     def overlap(self, column: Column, first: int, second: int) -> bool:
-        """Return True if two views have a common non-zero element."""
+        """Return True if some element has a non-zero gradient in both views."""
 
     def row_gramians(self, columns: Sequence[Column], rows: int) -> NDArray[np.float64]:
         """Return [rows, K, K], the Gramian of each row."""
@@ -28,23 +28,25 @@ class Passes(Protocol):
     def row_overlap(
         self, column: Column, first: int, second: int, rows: int, shared: NDArray[np.bool_]
     ) -> None:
-        """Mark rows in which two views have a common non-zero element."""
+        """Set `shared` to True for rows with an element that is non-zero in both views."""
 
     def row_combine(self, column: Column, weights: NDArray[np.float64], out: Tensor) -> None:
-        """Write the weighted sums of each row, with weights [rows, K]."""
+        """Write the weighted sum of each row, with weights [rows, K]."""
 
 
 def passes_of(*columns: Column) -> Passes:
-    """Return the compiled passes if they support all columns, else the torch passes."""
+    """Return the compiled functions if all columns are supported, else the torch functions."""
     return native if all(map(is_native, columns)) else generic
 
 
 def column_gramians(columns: Sequence[Column], views: int) -> NDArray[np.float64]:
-    """Return [T, K, K] float64 Gramians; NaN or infinite in rows of views that are not finite.
+    """Return [T, K, K] float64 Gramians.
 
-    float32 products are exact in float64 and can neither overflow nor underflow in float64. If
-    float64 gradients have magnitudes outside `SAFE`, all gradients are first multiplied by a power
-    of two.
+    Entries of a view with a non-finite gradient are NaN or infinite.
+
+    Products of float32 numbers are exact in float64. Products of float32 numbers can neither
+    overflow nor underflow in float64. If float64 gradients have magnitudes outside `SAFE`, all
+    gradients are first multiplied by a power of two.
     """
     gramians = np.zeros((len(columns), views, views))
     touched = [t for t, column in enumerate(columns) if any(g is not None for g in column)]
@@ -64,18 +66,21 @@ def column_gramians(columns: Sequence[Column], views: int) -> NDArray[np.float64
 def column_remainders(
     columns: Sequence[Column], group: NDArray[np.int64], gramians: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return [B, K, K], the rounding residuals of `gramians`, which are sums of `column_gramians`.
+    """Return [B, K, K], the rounding residuals of `gramians`.
+
+    Each of the given Gramians is a sum of results of `column_gramians`.
 
     Args:
-        columns: T columns.
-        group: [T] index of the sum that contains each column; -1 if no sum contains the column.
-        gramians: [B, K, K].
+        columns: T columns of gradients.
+        group: [T] index of the Gramian to which each column was added; -1 for a column that was not
+            added.
+        gramians: [B, K, K] rounded Gramians.
     """
     return rounding_residuals(columns, group, gramians, _scale(columns))
 
 
 def _scale(columns: Sequence[Column]) -> float:
-    """Return the power of two that keeps products of float64 gradients in the range of float64."""
+    """Return a power of two that keeps products of float64 gradients in the range of float64."""
     touched = [column for column in columns if any(g is not None for g in column)]
     wide = [column for column in touched if _dtype(column) == torch.float64]
     if not wide:
@@ -97,15 +102,16 @@ def rounding_residuals(
     gramians: NDArray[np.float64],
     scale: float,
 ) -> NDArray[np.float64]:
-    """Return [B, K, K], the exact Gramians (to about 106 bits) minus the rounded `gramians`.
+    """Return [B, K, K]: the Gramians with about 106 bits, minus the rounded `gramians`.
 
     The result is NaN if a Gramian is not finite.
 
     Args:
-        columns: T columns.
-        group: [T] index of the Gramian that contains each column; -1 leaves it out.
-        gramians: [B, K, K], rounded.
-        scale: Factor that the gradients were multiplied by.
+        columns: T columns of gradients.
+        group: [T] index of the Gramian to which each column was added; -1 for a column that was not
+            added.
+        gramians: [B, K, K] rounded Gramians.
+        scale: Factor by which the gradients were multiplied.
     """
     from crossgrad_core.gradients.numba_kernels.rounding_residuals import add_products, left_over
 
@@ -120,7 +126,7 @@ def rounding_residuals(
 def row_remainders(
     columns: Sequence[Column], rows: int, gramians: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return [N, K, K], the rounding residuals of the Gramians of the rows of a block's tensors."""
+    """Return [N, K, K], the rounding residuals of the Gramians of each row of a block."""
     from crossgrad_core.gradients.numba_kernels.rounding_residuals import (
         add_row_products,
         left_over,

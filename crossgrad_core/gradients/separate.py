@@ -1,4 +1,4 @@
-"""Separate gradients of K views, one tensor per view and parameter tensor."""
+"""Separate gradients of K views: each view has its own gradient of each parameter tensor."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,11 +24,11 @@ KINDS: Final = ("geometry", "appearance", "neutral")
 
 @dataclass(frozen=True)
 class Groups:
-    """The assignment of tensors to the Gramians of one granularity.
+    """The assignment of tensors to Gramians for one granularity.
 
     Attributes:
-        names: [B] name of each Gramian's block or group.
-        of_tensor: [T] index of the Gramian that each tensor belongs to.
+        names: [B] name of the block or group that each Gramian belongs to.
+        of_tensor: [T] index of the Gramian to which each tensor belongs.
     """
 
     names: tuple[str, ...]
@@ -36,18 +36,18 @@ class Groups:
 
 
 class DenseGradients(SeparateGradients):
-    """The gradients of K views, one tensor per view and parameter tensor.
+    """The gradients of K views; each view has its own gradient of each parameter tensor.
 
-    Sparse gradients stay sparse for Gramians of blocks and for sums; all other operations convert
-    them to dense tensors. Gramians are accumulated in float64 (see `column_gramians` for values
-    beyond its range).
+    Sparse gradients stay sparse for sums and for the Gramians of blocks. All other operations
+    convert sparse gradients to dense tensors. Gramians are computed in float64. `column_gramians`
+    describes how very large and very small gradients are processed.
 
     Args:
-        views: For each view: tensor name -> gradient; None or no entry means zero, because the view
+        views: For each view: tensor name -> gradient. None or a missing name means that the view
             does not touch the tensor.
-        blocks: The blocks, in the order of every Gramian's first dimension.
-        overwrite: True if `combine` and `total` may overwrite the gradients of one view with their
-            results. This saves memory, but the gradients can then be used only once.
+        blocks: The blocks of the backbone, in the order of the first dimension of Gramians.
+        overwrite: True if `combine` and `total` may write their results into the gradients of one
+            view. Overwritten gradients save memory, but can be used only once.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class DenseGradients(SeparateGradients):
     def rounding_residuals(self, granularity: Granularity) -> NDArray[np.float64]:
         if granularity not in self._lost:
             self._require_unspent()
-            # Residuals of infinite or NaN Gramians have no effect.
+            # A Gramian that is infinite or NaN is not used, so its residual is replaced by 0.
             residuals = np.nan_to_num(self._remainders(granularity), posinf=0.0, neginf=0.0)
             self._lost[granularity] = residuals
         return self._lost[granularity]
@@ -120,7 +120,7 @@ class DenseGradients(SeparateGradients):
     @override
     def overlap(self, granularity: Granularity) -> NDArray[np.bool_]:
         gramians, present = self.gramians(granularity), self.present(granularity)
-        # Gradients with a non-zero dot product share an element, so only pairs with a zero dot
+        # Gradients with a non-zero dot product share a non-zero element. Only pairs with a zero dot
         # product need a check.
         shared: NDArray[np.bool_] = gramians != 0
         doubtful = ~shared & present[:, :, None] & present[:, None, :]
@@ -159,7 +159,10 @@ class DenseGradients(SeparateGradients):
 
     @cached_property
     def _rows(self) -> tuple[int, ...]:
-        """Number of Gramians of each block under granularity `gaussian`."""
+        """Number of Gramians of each block for granularity `gaussian`.
+
+        With this granularity, each primitive has its own Gramian.
+        """
         self._unpack()
         shapes = {
             name: next((g.shape for g in column if g is not None), None)
@@ -173,7 +176,10 @@ class DenseGradients(SeparateGradients):
 
     @cached_property
     def _squares(self) -> NDArray[np.float64]:
-        """Gramians [T, K, K] of the tensors; NaN or infinite if a view is not finite."""
+        """Gramians [T, K, K] of the tensors.
+
+        Entries of a view with a non-finite gradient are NaN or infinite.
+        """
         self._require_unspent()
         columns = [[] if p.rows is not None else p.column for p in self._packed]
         squares = column_gramians(columns, self._views)
@@ -207,7 +213,10 @@ class DenseGradients(SeparateGradients):
         return Groups(kinds, np.repeat(places, counts))
 
     def _raw(self, granularity: Granularity) -> NDArray[np.float64]:
-        """Return [B, K, K] Gramians, computed once; NaN or infinite if a view is not finite."""
+        """Return [B, K, K] Gramians, which are computed only once.
+
+        Entries of a view with a non-finite gradient are NaN or infinite.
+        """
         if granularity not in self._known:
             self._known[granularity] = self._gathered(granularity)
         return self._known[granularity]
@@ -219,7 +228,7 @@ class DenseGradients(SeparateGradients):
         if len(groups.names) == len(self._tensors) and granularity == "block":
             return self._squares
         raw = np.zeros((len(groups.names), self._views, self._views))
-        # The sum of infinities of both signs is NaN, which is correct.
+        # The sum of infinity and minus infinity is NaN, which is intended here.
         with np.errstate(invalid="ignore"):
             np.add.at(raw, groups.of_tensor, self._squares)
         return raw
@@ -289,7 +298,10 @@ class DenseGradients(SeparateGradients):
     def _combine(
         self, weights: NDArray[np.float64], finite: NDArray[np.bool_], divisor: int = 1
     ) -> dict[str, Tensor | None]:
-        """Return weighted sums of all tensors; `weights` and `finite` are [T, K]."""
+        """Return the weighted sums for all tensors.
+
+        The arrays `weights` and `finite` are [T, K].
+        """
         results: dict[str, Tensor | None] = dict.fromkeys(self._tensors)
         used = weights != 0
         plain = ((weights == 1) | ~used).all(axis=1) & used.any(axis=1)
@@ -318,9 +330,12 @@ class DenseGradients(SeparateGradients):
         return {n: p.unpacked(results[n]) for n, p in zip(results, self._packed, strict=True)}
 
     def _order(self, weights: NDArray[np.float64], plain: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """Return [T, K] view indices, largest summand first; plain sums keep the order of views."""
+        """Return [T, K], the order in which the views are added.
+
+        Weighted sums begin with the largest summand; plain sums keep the order of the views.
+        """
         order = np.tile(np.arange(self._views), (len(self._tensors), 1))
-        # With two views, the order of the summands has no effect.
+        # The order of two summands does not change the sum.
         if self._views > 2 and not plain.all():  # noqa: PLR2004
             squares = _diagonal(self._squares)
             norms = np.sqrt(np.where(np.isfinite(squares), squares, 0.0))
@@ -345,7 +360,10 @@ class DenseGradients(SeparateGradients):
         return results
 
     def _result(self, column: Column, finite: NDArray[np.bool_]) -> Tensor | None:
-        """Return a tensor for the result; None if no finite view touches the parameter tensor."""
+        """Return a tensor for the result.
+
+        Return None if no view has a finite gradient of the parameter tensor.
+        """
         self._require_unspent()
         first = next((g for g in _selected(column, finite) if g is not None), None)
         if first is None:

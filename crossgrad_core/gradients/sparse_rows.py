@@ -1,7 +1,7 @@
-"""Gradients that are zero in most rows, stored as torch's sparse tensors: rows and values.
+"""Gradients that are zero in most rows, stored as sparse torch tensors of rows and values.
 
-Rows are sorted and unique (`coalesced`). Sums and products of such gradients equal the results for
-dense gradients on the union of their rows.
+After `coalesced`, the rows are sorted and unique. Sums and products equal the results for dense
+gradients, on all rows that occur in any of the sparse gradients.
 """
 
 from collections.abc import Sequence
@@ -13,22 +13,22 @@ from crossgrad_core.gradients.columns import Column, is_native
 
 
 def sparse_rows(rows: Tensor, values: Tensor, shape: Sequence[int]) -> Tensor:
-    """Return the sparse gradient of `shape` with `values` [R, ...] in `rows` [R] int64."""
+    """Return a sparse gradient of shape `shape` that has `values` [R, ...] in `rows` [R] int64."""
     return torch.sparse_coo_tensor(rows[None], values, tuple(shape), check_invariants=False)
 
 
 def rows_of(gradient: Tensor) -> Tensor:
-    """Return [R] int64 rows of a sparse gradient."""
+    """Return the row numbers [R] int64 of a sparse gradient."""
     return gradient._indices()[0]  # noqa: SLF001 - the public function needs a flag that autograd drops
 
 
 def values_of(gradient: Tensor) -> Tensor:
-    """Return [R, ...] values of a sparse gradient."""
+    """Return the values [R, ...] of a sparse gradient."""
     return gradient._values()  # noqa: SLF001 - see above
 
 
 def coalesced(gradient: Tensor | None) -> Tensor | None:
-    """Return the gradient; a sparse gradient gets sorted and unique rows."""
+    """Return the gradient. The rows of a sparse gradient become sorted and unique."""
     if gradient is None or not gradient.is_sparse:
         return gradient
     if gradient.sparse_dim() != 1:
@@ -42,7 +42,7 @@ def coalesced(gradient: Tensor | None) -> Tensor | None:
 
 def _rises(rows: Tensor) -> bool:
     """Return True if the numbers are strictly increasing."""
-    if rows.is_cpu:  # Use NumPy, because it has less overhead than torch.
+    if rows.is_cpu:  # NumPy has less overhead than torch for this comparison.
         numbers = rows.numpy()
         return bool((numbers[1:] > numbers[:-1]).all())
     return bool((rows[1:] > rows[:-1]).all())
@@ -58,12 +58,13 @@ def dense(gradient: Tensor | None) -> Tensor | None:
 
 
 class PackedRows:
-    """A column of gradients, stored on the union of their rows.
+    """A column of gradients, stored on all rows that occur in any of its gradients.
 
     Attributes:
-        column: K gradients of these rows. If one gradient is dense, all are dense.
-        rows: [R] int64; None if the gradients are dense.
-        shape: Shape of the whole tensor.
+        column: The K gradients, with values for `rows` only. If any gradient is dense, all
+            gradients are stored as dense tensors.
+        rows: [R] int64 row numbers; None if the gradients are dense.
+        shape: Shape of the complete tensor.
     """
 
     def __init__(self, column: Column) -> None:
@@ -81,7 +82,7 @@ class PackedRows:
         self.column = [None if g is None else _on(g, self.rows) for g in column]
 
     def unpacked(self, result: Tensor | None) -> Tensor | None:
-        """Return a result of the column as a gradient of the whole tensor."""
+        """Return a result that was computed from the column, but for the complete tensor."""
         if result is None or self.rows is None:
             return result
         # Mark the tensor as coalesced, so that torch does not sort its rows again.
@@ -89,7 +90,7 @@ class PackedRows:
 
 
 def _union(rows: Sequence[Tensor], count: int) -> Tensor:
-    """Return [R], the rows (below `count`) that are in any of the lists."""
+    """Return [R], all rows that occur in any of the lists. All row numbers are below `count`."""
     if len(rows) == 1:
         return rows[0]
     there = torch.zeros(count, dtype=torch.bool)
@@ -99,7 +100,10 @@ def _union(rows: Sequence[Tensor], count: int) -> Tensor:
 
 
 def _on(gradient: Tensor, rows: Tensor) -> Tensor:
-    """Return [R, ...], the values of a gradient in `rows`, which contain all of its rows."""
+    """Return [R, ...], the values of a gradient in `rows`.
+
+    The list `rows` must include all rows of the gradient.
+    """
     gradient_rows, values = rows_of(gradient), values_of(gradient)
     if len(gradient_rows) == len(rows):
         return values.contiguous()

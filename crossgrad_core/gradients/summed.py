@@ -1,4 +1,4 @@
-"""The running sum of the gradients of K views, for operators without separate gradients."""
+"""The running sum of the gradients of K views, for operators that use only this sum."""
 
 from collections.abc import Mapping, Sequence
 from typing import Self
@@ -18,16 +18,18 @@ from crossgrad_core.gradients.sparse_rows import PackedRows
 
 
 def plain_sums(columns: Sequence[Column], divisor: int, *, keep: bool) -> list[Tensor | None]:
-    """Add each column's gradients in order and in their own type, then divide.
+    """Add the gradients of each column in their own type, in the order of the views.
+
+    After the addition, divide the sums by `divisor`.
 
     Args:
-        columns: T columns of contiguous gradients, dense or sparse by rows; None is left out.
-        divisor: Divisor of the sums.
-        keep: True to leave the gradients unchanged; otherwise the first gradient of each column is
-            overwritten with the result.
+        columns: T columns of contiguous gradients, dense or sparse in rows; None is left out.
+        divisor: Number by which the sums are divided.
+        keep: True to leave the gradients unchanged. If `keep` is False, each result overwrites the
+            first gradient of its column.
 
     Returns:
-        T sums, None for columns without a gradient.
+        T sums; None for a column without gradients.
     """
     packed = [PackedRows(column) for column in columns]
     sums = _plain_sums([packed_column.column for packed_column in packed], divisor, keep=keep)
@@ -69,16 +71,19 @@ def _add_into(out: Tensor, column: Sequence[Tensor], divisor: int) -> None:
 
 
 class SummedGradients(Gradients):
-    """The sum of K views' gradients in the order of the views; single views are not kept.
+    """The sum of the gradients of K views, added in the order of the views.
 
-    The sum is given as a whole (one backward pass of a joint loss), or built view by view from
-    `empty` with `add`. `add` ignores a view in those blocks in which its gradient is not finite.
-    `total` adds the last view and divides in a single pass.
+    Gradients of single views are not stored.
+
+    The constructor receives a complete sum, for example from the backward pass of a joint loss.
+    `empty` and `add` build a sum view by view. If a view's gradient of a block is not finite, `add`
+    leaves out the view for this block. `total` adds the last view and divides the sum in a single
+    pass over memory.
 
     Args:
-        total: Tensor name -> sum; None or no entry if no view touches the tensor.
-        blocks: The blocks.
-        views: K.
+        total: Sum for each tensor, by name; None or a missing name if no view touches the tensor.
+        blocks: The blocks of the backbone.
+        views: Number of views K in `total`.
     """
 
     def __init__(
@@ -89,7 +94,8 @@ class SummedGradients(Gradients):
         self._last: dict[str, Tensor] = {}
         self._divisor = 0
         self._views = self._expected = views
-        #: Gradients that were checked, with their tensor versions at the time of the check.
+        #: Gradients that were checked, with the version counter of each tensor at the time of the
+        #: check.
         self._looked: dict[str, tuple[Tensor, int]] = {}
         self._finite: list[NDArray[np.bool_]] = []
         self._present: list[NDArray[np.bool_]] = []
@@ -101,16 +107,18 @@ class SummedGradients(Gradients):
 
     @classmethod
     def empty(cls, blocks: Sequence[Block], views: int) -> Self:
-        """Return a sum without views that expects `views` views."""
+        """Return a sum that contains no view yet and expects `views` views."""
         gradients = cls({}, blocks, 0)
         gradients._expected = views
         return gradients
 
     def add(self, view: Mapping[str, Tensor | None]) -> None:
-        """Add the gradients of one more view; this object then owns and overwrites them.
+        """Add the gradients of one more view.
+
+        The caller must not use these gradients any more, because `add` and `total` overwrite them.
 
         Raises:
-            RuntimeError: All expected views were already added.
+            RuntimeError: All expected views have already been added.
         """
         if self._views == self._expected:
             raise RuntimeError(
@@ -135,10 +143,10 @@ class SummedGradients(Gradients):
 
     @override
     def total(self, divisor: int = 1) -> Mapping[str, Tensor | None]:
-        """Return the sum for each tensor; see `Gradients.total`.
+        """Return the sum for each tensor, divided by `divisor` (see `Gradients.total`).
 
         Raises:
-            RuntimeError: The sum was already divided by another number.
+            RuntimeError: The sum has already been divided by another number.
         """
         if self._divisor in {0, divisor}:
             if not self._divisor:
@@ -170,7 +178,10 @@ class SummedGradients(Gradients):
         return gradient is judged_tensor and gradient._version == version  # noqa: SLF001
 
     def _remember(self) -> None:
-        """Record the checked sum; only for a single view, because a sum of views may overflow."""
+        """Record that the sum was checked.
+
+        Record this only for a single view, because a sum of several views may overflow.
+        """
         self._looked = {
             name: (gradient, gradient._version)  # noqa: SLF001
             for name, gradient in self._sum.items()
@@ -180,7 +191,7 @@ class SummedGradients(Gradients):
     def _judged(
         self, view: Mapping[str, Tensor | None]
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return two arrays [B]: True for finite gradients, True for finite non-zero gradients."""
+        """Return two arrays [B] over blocks: finite gradients, and finite non-zero gradients."""
         names = [name for block in self._blocks for name in block.tensors]
         flags = all_finite_and_present([view.get(name) for name in names])
         flags_by_name = dict(zip(names, flags, strict=True))
@@ -192,7 +203,7 @@ class SummedGradients(Gradients):
         return finite, finite & present
 
     def _fold(self, divisor: int) -> None:
-        """Add the pending view and divide."""
+        """Add the gradients of the last view to the sum, and divide the sum by `divisor`."""
         columns = [[gradient, self._last.get(name)] for name, gradient in self._sum.items()]
         sums = plain_sums(columns, divisor, keep=False)
         self._sum = dict(zip(self._sum, sums, strict=True))

@@ -1,9 +1,9 @@
-"""Element-wise functions with the same bits on any number of threads.
+"""Element-wise functions whose results are bit-identical for any number of threads.
 
-torch divides long tensors among its threads. Scalar code processes the remainder of each part and
-rounds differently from the vectorised code. For functions of the vector library (exp, tanh) the
-results are equal. For the sigmoid, a few results differ. A whole training run would then depend on
-the number of threads.
+torch divides long tensors into parts, one for each thread. In each part, the last elements are
+computed by scalar code, which may round differently from vectorised code. For exp and tanh, scalar
+and vectorised code give equal results. For the sigmoid, a few results differ. With torch's sigmoid,
+the result of a training run would therefore depend on the number of threads.
 """
 
 from collections.abc import Callable
@@ -14,12 +14,12 @@ from torch import Tensor
 from torch.nn import functional
 from typing_extensions import override
 
-#: Number of elements up to which torch never divides a tensor among threads.
+#: torch never divides a tensor of at most this number of elements among threads.
 BLOCK = 2**14
 
 
 def sigmoid(values: Tensor) -> Tensor:
-    """Return 1 / (1 + exp(-x)) of a floating-point tensor of any shape."""
+    """Return 1 / (1 + exp(-x)) for each element of a floating-point tensor."""
     if _is_whole(values):
         return torch.sigmoid(values)
     result: Tensor = _Sigmoid.apply(values)  # type: ignore[no-untyped-call]
@@ -27,7 +27,10 @@ def sigmoid(values: Tensor) -> Tensor:
 
 
 class _Sigmoid(torch.autograd.Function):
-    """`sigmoid_` with a gradient, which has the same bits for any number of threads."""
+    """The sigmoid with its gradient.
+
+    The sigmoid and its gradient are bit-identical for any number of threads.
+    """
 
     @staticmethod
     @override
@@ -45,12 +48,15 @@ class _Sigmoid(torch.autograd.Function):
 
 
 def logsigmoid(values: Tensor) -> Tensor:
-    """Return the logarithm of `sigmoid`, accurate even if `sigmoid` rounds to 0."""
+    """Return the logarithm of the sigmoid.
+
+    The logarithm is accurate even if the sigmoid rounds to 0.
+    """
     return _in_blocks(functional.logsigmoid, values)
 
 
 def sigmoid_(values: Tensor) -> Tensor:
-    """Compute `sigmoid` in place, for a contiguous tensor without a gradient."""
+    """Compute the sigmoid in place, for a contiguous tensor that requires no gradient."""
     for block in torch.split(values.view(-1), BLOCK):
         block.sigmoid_()
     return values

@@ -2,7 +2,7 @@
 
 
 def hash32(number: int) -> int:
-    """Return a pseudo-random number of 32 bits (the finalizer of MurmurHash3)."""
+    """Return a pseudo-random 32-bit number for `number` (the finalizer of MurmurHash3)."""
     number = (number ^ number >> 16) * 0x85EBCA6B % 2**32
     number = (number ^ number >> 13) * 0xC2B2AE35 % 2**32
     return number ^ number >> 16

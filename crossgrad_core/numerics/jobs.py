@@ -1,21 +1,22 @@
-"""Dynamic distribution of jobs over threads: each thread takes the next job when it is idle.
+"""Distribute jobs over threads dynamically: each thread takes the next job when it is idle.
 
-A kernel takes jobs until none is left:
+A kernel takes jobs until no job is left:
 
     job = next_job(jobs, count)
     while job < count:
         ...
         job = next_job(jobs, count)
 
-`parallel` calls the kernel on all threads at once. Numba's own `prange` divides the work into equal
-parts in advance and waits for every thread. If a core is busy or slow, waiting takes longer than
-computing with one thread. Here, a helper thread that starts too late is skipped, and idle threads
-sleep.
+`parallel` calls the kernel on all threads at the same time. Numba's own `prange` divides the work
+into equal parts in advance, and waits for all threads. If another program uses a core, this wait
+can take longer than the computation with one thread. In this module, a helper thread that starts
+too late is not waited for, and idle threads sleep.
 
-A thread starts with its own range of jobs and continues with the remaining jobs of other threads.
-Therefore, a thread reads the data that it wrote in the previous kernel, and the cache of its core
-still contains this data. The result of a job must not depend on the thread that runs the job. Then
-the number of threads does not change any bit of the results.
+Each thread begins with its own range of jobs, and then continues with jobs from the ranges of other
+threads. A thread therefore often reads data that the same thread wrote in the previous kernel. Data
+from the previous kernel are still in the cache of the thread's core. The result of a job must not
+depend on the thread that executes the job. With this property, no bit of the results depends on the
+number of threads.
 """
 # ruff: noqa: ANN401, ARG001 - Numba's objects have no types, and Numba defines the arguments.
 
@@ -50,17 +51,19 @@ def _add(typing: Any, jobs: Any, place: Any) -> Any:
     return types.int64(jobs, types.intp), generate
 
 
-#: Add 1 to a shared number atomically, and return the former value.
+#: Add 1 to a shared counter atomically, and return the previous value.
 _next = cast("Callable[[Jobs, int], int]", intrinsic(_add))
 
 
 @device
 def next_job(jobs: Jobs, count: int) -> int:
-    """Return the number of a free job, or `count` if no job is left; only for use in kernels.
+    """Return the number of a free job, or `count` if no job is left.
+
+    Only kernels may call this function.
 
     Args:
         jobs: Job counters, passed by `parallel` or `serial`.
-        count: Number of jobs, the same in every call of a kernel.
+        count: Number of jobs, which must be equal in all calls of a kernel.
     """
     threads = jobs[0]
     mine = jobs.shape[0] - 1 - threads
@@ -75,9 +78,11 @@ def next_job(jobs: Jobs, count: int) -> int:
 
 
 def _jobs(threads: int) -> list[Jobs]:
-    """Return for each thread: the number of threads, and the jobs taken from each thread's range.
+    """Return an array of counters for each thread.
 
-    The arrays share one memory block. A thread derives its own number from the length of its array.
+    The array contains the number of threads, and how many jobs were taken from each thread's range.
+
+    All arrays share one memory block. A thread derives its own number from the length of its array.
     """
     room = np.zeros(2 * threads, np.int64)
     room[0] = threads
@@ -87,18 +92,18 @@ def _jobs(threads: int) -> list[Jobs]:
 def parallel(
     kernel: Callable[Concatenate[Jobs, P], None], *args: P.args, **kwargs: P.kwargs
 ) -> None:
-    """Run a kernel on Numba's number of threads; return when all jobs are done."""
+    """Run a kernel on as many threads as Numba uses. Return when all jobs are done."""
     Begun(kernel, *args, **kwargs).end()
 
 
 class Begun:
-    """A kernel that runs on the other threads while the calling thread does other work.
+    """A kernel that runs on other threads while the calling thread continues with other work.
 
-    No other code may use the data of the kernel until `end` returns. With one thread, the kernel
-    runs to its end immediately.
+    No other code may use the kernel's data until `end` returns. If only one thread is available,
+    the kernel runs to its end immediately.
 
     Args:
-        kernel: The kernel, as for `parallel`; its arguments follow.
+        kernel: The kernel, as for `parallel`. The arguments of the kernel follow.
     """
 
     def __init__(
@@ -113,16 +118,16 @@ class Begun:
             self.end()
 
     def end(self) -> None:
-        """Do the remaining jobs on this thread as well, and return when all jobs are done.
+        """Execute the remaining jobs on this thread, too. Return when all jobs are done.
 
-        The object then holds no more references; further calls have no effect.
+        After `end`, the object holds no references, and further calls have no effect.
         """
         if self._own is None:
             return
         try:
             self._own()
         finally:
-            # Wait for all threads even after an error, so that none uses the arrays after this
+            # Wait for all threads even after an error. No thread may use the arrays after this
             # method returns.
             self.leave()
         for call in self._calls:
@@ -131,22 +136,24 @@ class Begun:
         self._own, self._calls = None, []
 
     def leave(self) -> None:
-        """Return when no helper works on the kernel any more, even if jobs are left."""
+        """Return when no helper thread works on the kernel any more, even if jobs are left."""
         for call in self._calls:
             call.end()
 
 
 class _Call:
-    """A call for a helper, skipped if it is no longer needed when the helper starts.
+    """A call for a helper thread.
 
-    The class uses a bare lock, because a `Future` creates conditions for each call and for each
+    The call is skipped if its result is no longer needed when a thread starts the call.
+
+    A plain lock is used, because a `Future` creates condition variables for each call and each
     wait.
 
     Args:
-        call: The function to call.
+        call: The function that the helper thread calls.
 
     Attributes:
-        error: The exception of the call; None if there was none.
+        error: The exception that the function raised; None without an exception.
     """
 
     def __init__(self, call: Callable[[], None]) -> None:
@@ -156,7 +163,7 @@ class _Call:
         self._under_way = threading.Lock()
 
     def make(self) -> None:
-        """Execute the call; this function is called by a helper thread."""
+        """Execute the call. A helper thread calls this method."""
         with self._under_way:
             if not self._needed:
                 return
@@ -166,29 +173,34 @@ class _Call:
                 self.error = error
 
     def end(self) -> None:
-        """Return when the call has finished or is cancelled; `end` may be called repeatedly."""
+        """Wait until the call has finished; if the call has not begun, cancel it.
+
+        Further calls of `end` have no effect.
+        """
         self._needed = False
         with self._under_way:
             pass
 
 
 class _Helpers:
-    """The helper threads of a process, on other cores than the calling thread.
+    """The helper threads of a process. Helper threads use other cores than the calling thread.
 
-    When a thread wakes another thread, Linux starts the woken thread on the same core and moves it
-    to an idle core later. This takes longer than most kernels.
+    When a thread wakes another thread, Linux first starts the woken thread on the core of the
+    waking thread. Linux moves the woken thread to an idle core later. The move to an idle core
+    takes longer than most kernels.
     """
 
     def __init__(self) -> None:
         self._threads: list[int] = []
         self._core: int | None = None
-        # Each thread has its own queue, so that equal jobs go to the same core.
+        # Each thread has its own queue, so that a core repeatedly processes the same part of the
+        # data.
         self._helpers: list[tuple[SimpleQueue[_Call | None], threading.Thread]] = []
-        # A thread inside a library at interpreter exit would abort the process.
+        # If a helper thread were inside a library at interpreter exit, the process would abort.
         atexit.register(self._dismiss)
 
     def ask(self, calls: Sequence[_Call]) -> None:
-        """Give each call to a helper thread of its own."""
+        """Give each call to a different helper thread."""
         core = current_core()
         if core != self._core:
             self._core = core
@@ -204,15 +216,15 @@ class _Helpers:
             queue.put(call)
 
     def _help(self, queue: "SimpleQueue[_Call | None]") -> None:
-        """Make calls until the queue returns None."""
+        """Execute calls from the queue until the queue returns None."""
         self._threads.append(threading.get_native_id())
         keep_off(self._core, self._threads[-1:])
         while (call := queue.get()) is not None:
             call.make()
-            del call  # Release the arrays of the call before the next call arrives.
+            del call  # Release the arrays of this call before the next call arrives.
 
     def _dismiss(self) -> None:
-        """Stop the helper threads."""
+        """Stop all helper threads."""
         for queue, thread in self._helpers:
             queue.put(None)
             thread.join()
@@ -221,11 +233,18 @@ class _Helpers:
 
 @cache
 def _helpers(process: int) -> _Helpers:
-    """Return the helpers of a process; a forked process does not inherit its parent's threads."""
+    """Return the helper threads of a process.
+
+    A forked process starts new threads, because threads of the parent process do not exist in the
+    fork.
+    """
     return _Helpers()
 
 
 def serial(kernel: Callable[Concatenate[Jobs, P], None], *args: P.args, **kwargs: P.kwargs) -> None:
-    """Run a kernel on this thread only, for little work; the result has the same bits."""
+    """Run a kernel on this thread only, for small amounts of work.
+
+    The result is bit-identical to the result of `parallel`.
+    """
     (jobs,) = _jobs(1)
     kernel(jobs, *args, **kwargs)

@@ -1,8 +1,8 @@
-"""Disk cache of compiled kernels: a file's name depends on all sources of its kernel.
+"""Disk cache of compiled kernels: the name of a file depends on all source files of its kernel.
 
-One file contains one kernel for one signature: the SHA-256 of the remaining content, then the key
-and Numba's result. There is no index that two processes could overwrite. A file is written
-completely or not at all, and a damaged file counts as missing.
+A file contains one kernel for one signature: a SHA-256 checksum, then the key and the compiled
+code. There is no common index file, which two processes could overwrite at the same time. A file is
+written completely or not at all. A damaged file is ignored.
 """
 
 import ast
@@ -34,10 +34,10 @@ _COMPILING, _COMPILED = "compiling %s", "compiled %s"
 
 
 class Listener(Protocol):
-    """A callback before the compilation of a kernel."""
+    """A function that is called before a kernel is compiled."""
 
     def __call__(self, *, kept: bool) -> None:
-        """Handle the event; `kept` is True if the compiled kernel will be stored on disk."""
+        """Handle the event. `kept` is True if the compiled kernel will be stored on disk."""
         ...
 
 
@@ -46,7 +46,7 @@ _LISTENERS: list[Listener] = []
 
 @contextmanager
 def notes_on_missing(listener: Listener) -> Iterator[None]:
-    """Call the listener before each compilation of a kernel that is not on disk."""
+    """Inside the block, call the listener before each kernel that must be compiled."""
     _LISTENERS.append(listener)
     try:
         yield
@@ -55,21 +55,23 @@ def notes_on_missing(listener: Listener) -> Iterator[None]:
 
 
 def cache_for(function: Callable[..., Any]) -> Any:  # noqa: ANN401 - Numba's caches are untyped
-    """Return the cache of a kernel: on disk if a folder is writable, else none.
+    """Return the cache of a kernel.
 
-    The folder is `NUMBA_CACHE_DIR` if set, else `__pycache__` next to the kernel's file, else the
-    user's cache folder.
+    The cache is on disk if a folder is writable; otherwise, nothing is cached.
+
+    The folder is `NUMBA_CACHE_DIR` if this variable is set. If this variable is not set, the folder
+    is `__pycache__` next to the kernel's file, or the user's cache folder.
     """
     try:
         return _DiskCache(function)
-    except RuntimeError:  # Numba found no writable folder.
+    except RuntimeError:  # Numba raises this error if no folder is writable.
         _tell_uncached(str(Path(function.__code__.co_filename).parent))
         return _NoCache(function)
 
 
 @cache
 def _tell_uncached(folder: str) -> None:
-    """Warn once per folder that its kernels cannot be stored."""
+    """Warn that the kernels of a folder cannot be stored. Each folder causes only one warning."""
     _LOG.warning(
         "compiled kernels cannot be saved and are compiled again at every start: "
         "neither %s nor the user's cache folder is writable; set "
@@ -89,7 +91,7 @@ def _tell_compiling(name: str, *, kept: bool) -> None:
 
 
 class _NoCache(cast("Any", NullCache)):  # type: ignore[misc]
-    """A cache that stores nothing."""
+    """A replacement for the disk cache that stores nothing."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self._name = _name(function)
@@ -101,12 +103,12 @@ class _NoCache(cast("Any", NullCache)):  # type: ignore[misc]
 
     @override
     def save_overload(self, sig: object, cres: object) -> None:
-        """Store nothing; log that the kernel was compiled."""
+        """Store nothing, but log that the kernel was compiled."""
         _LOG.info(_COMPILED, self._name)
 
 
 class _DiskCache(cast("Any", FunctionCache)):  # type: ignore[misc]
-    """Numba's function cache with the file format of this module."""
+    """Numba's function cache, but with the file format of this module."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
@@ -115,9 +117,9 @@ class _DiskCache(cast("Any", FunctionCache)):  # type: ignore[misc]
 
     @override
     def load_overload(self, sig: object, target_context: object) -> object | None:
-        """Return the compiled function; None if it must be compiled."""
+        """Return the compiled function. Return None if the function must be compiled."""
         compiled = None
-        # Any error of a file is ignored, because the kernel can always be compiled.
+        # Ignore any error from a cache file, because the kernel can always be compiled.
         with suppress(Exception):
             compiled = super().load_overload(sig, target_context)
         if compiled is None:
@@ -126,12 +128,13 @@ class _DiskCache(cast("Any", FunctionCache)):  # type: ignore[misc]
 
     @override
     def save_overload(self, sig: object, data: object) -> None:
-        """Store a compiled function if possible."""
+        """Store a compiled function on disk if possible."""
         _LOG.info(_COMPILED, _name(self._py_func))
         try:
             super().save_overload(sig, data)
         except OSError as error:
-            # Saving can fail, for example on a full disk. The compiled function is still valid.
+            # Saving can fail, for example if the disk is full. The compiled function can still be
+            # used in this process.
             self.disable()
             _tell_unwritten(str(self._cache_path), str(error))
 
@@ -150,9 +153,9 @@ class _Files:
     """The cache files of one kernel.
 
     Args:
-        folder: The folder of the files.
+        folder: Folder of the cache files.
         base: Prefix of the file names.
-        source: The source file of the kernel.
+        source: Source file of the kernel.
     """
 
     def __init__(self, folder: Path, base: str, source: Path) -> None:
@@ -161,7 +164,7 @@ class _Files:
         self._source = source
 
     def load(self, key: object) -> object | None:
-        """Return the data stored under the key; None if there is no valid file."""
+        """Return the data that is stored under the key; None without a valid file."""
         try:
             content = self._path(key).read_bytes()
         except OSError:
@@ -173,7 +176,10 @@ class _Files:
         return cast("object", data) if stored == key else None
 
     def save(self, key: object, data: object) -> None:
-        """Store data under the key, and delete kernels compiled from older sources."""
+        """Store data under the key.
+
+        Delete files of the kernel that were compiled from older sources.
+        """
         payload = _DUMPS((key, data))
         path = self._path(key)
         temporary = path.with_suffix(f".{os.getpid()}.tmp")
@@ -185,7 +191,7 @@ class _Files:
         self._drop_older()
 
     def flush(self) -> None:
-        """Delete all files of the kernel."""
+        """Delete all cache files of the kernel."""
         for path in self._folder.glob(f"{self._base}.*"):
             path.unlink(missing_ok=True)
 
@@ -200,19 +206,19 @@ class _Files:
     def _drop_older(self) -> None:
         for path in self._folder.glob(f"{self._base}.*"):
             if not path.name.startswith(self._generation) and path.suffix != ".tmp":
-                # Another process may have removed the file first, or may hold the file open.
+                # Another process may already have deleted the file, or may have the file open.
                 with suppress(OSError):
                     path.unlink()
 
 
 @cache
 def fingerprint(source: Path) -> str:
-    """Return the SHA-256 of all files whose constants and functions a kernel in `source` may use.
+    """Return the SHA-256 of all source files that may affect a kernel in `source`.
 
-    Numba notices changes of the kernel's own file, but not of files that contain inlined functions.
-    The hash covers all files of the kernel's folder. It also covers the files that they import from
-    their own package or from the core. If an imported file is in a folder of kernels, its imports
-    are included as well.
+    Numba itself detects changes of the kernel's file, but not of files whose functions are inlined.
+    The hash includes all files of the kernel's folder. The hash also includes all files that the
+    files of this folder import from their own package or from the core. If an imported file is in a
+    folder of kernels, its imports are included as well.
     """
     digest = hashlib.sha256()
     for path in sorted(_sources(source)):
@@ -233,9 +239,9 @@ def _sources(source: Path) -> set[Path]:
 
 @cache
 def _imported(path: Path) -> frozenset[Path]:
-    """Return the files of modules that a file imports from its own package or from the core.
+    """Return the files that a file imports from its own package or from the core.
 
-    The result is cached, because most kernel files import the same files.
+    The result is cached, because many kernel files import the same modules.
     """
     packages, files = {_CORE, _package_of(path)}, set[Path]()
     for node in ast.walk(ast.parse(path.read_bytes())):
@@ -249,7 +255,7 @@ def _imported(path: Path) -> frozenset[Path]:
 
 
 def _package_of(path: Path) -> str:
-    """Return the name of the outermost package that contains a file."""
+    """Return the name of the top-level package that contains a file."""
     folder = path.parent
     while (folder.parent / "__init__.py").is_file():
         folder = folder.parent

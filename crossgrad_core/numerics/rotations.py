@@ -1,11 +1,11 @@
-"""Conversion of quaternions to rotation matrices."""
+"""Convert quaternions to rotation matrices."""
 
 from typing import TypeVar
 
 import torch
 from torch import Tensor
 
-#: Numbers, arrays or tensors of equal shape.
+#: Numbers, or tensors of equal shape.
 T = TypeVar("T", float, Tensor)
 
 
@@ -19,11 +19,14 @@ def matrix_rows(w: T, x: T, y: T, z: T) -> tuple[tuple[T, T, T], ...]:
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
-    """Return rotations [N, 3, 3] of quaternions [N, 4] wxyz; a zero quaternion gives identity."""
+    """Return the rotation matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z).
+
+    A zero quaternion gives the identity.
+    """
     length = quats.norm(dim=-1, keepdim=True)
     return unit_rotation_matrices(quats / torch.where(length > 0, length, 1.0))
 
 
 def unit_rotation_matrices(quats: Tensor) -> Tensor:
-    """Return rotations [N, 3, 3] of unit quaternions [N, 4] wxyz."""
+    """Return the rotation matrices [N, 3, 3] of unit quaternions [N, 4] (w, x, y, z)."""
     return torch.stack([torch.stack(row, -1) for row in matrix_rows(*quats.unbind(-1))], -2)

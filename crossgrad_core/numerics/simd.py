@@ -1,16 +1,18 @@
-"""Vectors of eight or sixteen float32 lanes inside compiled kernels.
+"""SIMD vectors of eight or sixteen float32 lanes for compiled kernels.
 
-Numba leaves vectorisation to LLVM's loop vectoriser, which fails on the compositing loops, because
-each iteration depends on the previous iteration. This module makes the vector a type: `Lanes` holds
-eight float32 numbers and `Mask` eight truth values. A kernel that uses these types is SIMD code by
-construction. Each vector uses one AVX register; LLVM splits it on machines with narrower registers.
-Functions with names that end in `_wide` make vectors of sixteen lanes. Such vectors need half the
-instructions on machines with AVX-512, and two instructions each on other machines. All other
-functions accept vectors of both widths. Operations are never reordered, and `fma` fuses on every
-machine that supports it, so the same expression in two kernels gives the same bits.
+Numba relies on LLVM's loop vectoriser. The vectoriser fails for compositing loops, because each
+iteration depends on the previous iteration. The module therefore defines vector types: `Lanes` for
+float32 numbers, and `Mask` for truth values. A kernel that uses these types always compiles to SIMD
+instructions. A vector of eight lanes uses one AVX register. On machines with narrower registers,
+LLVM splits the vector. Functions whose names end in `_wide` create vectors of sixteen lanes. With
+AVX-512, sixteen lanes need half as many instructions. Other machines need two instructions for each
+operation. All other functions accept vectors of eight and of sixteen lanes. Operations are never
+reordered, and `fma` is always fused on machines that support fused operations. Equal expressions in
+two kernels therefore give equal bits.
 
-Functions exist only inside compiled kernels; `Lanes` and `Mask` are annotations. A kernel that
-needs other lane operations can define them with `emitted` and the helpers of this module.
+The functions work only inside compiled kernels. `Lanes` and `Mask` serve as type annotations. A
+kernel that needs further lane operations can define its own operations with `emitted` and the
+helper functions of this module.
 """
 # ruff: noqa: ANN401, ARG005 - Numba's objects have no types, and Numba defines the arguments.
 
@@ -30,7 +32,7 @@ LANES = 8
 WIDE = 2 * LANES
 
 _FLOAT, _BYTE, _INT, _LONG = ir.FloatType(), ir.IntType(8), ir.IntType(32), ir.IntType(64)
-_ALIGNMENT = 4  # In bytes. Float32 arrays guarantee no larger alignment
+_ALIGNMENT = 4  # In bytes. Float32 arrays guarantee no larger alignment.
 _SIGN_BIT, _MANTISSA_BITS = -(2**31), 23
 
 
@@ -64,7 +66,8 @@ class _MaskType(types.Type):
         cast("Any", super()).__init__(name=f"Mask{width}")
 
 
-#: Types of vectors. To get a type, call them with a width.
+#: Types of vectors, not yet with a number of lanes. Call `_lanes` or `_mask` with a number of lanes
+#: to get a type.
 _lanes, _mask = _LanesType, _MaskType
 
 
@@ -73,11 +76,11 @@ def _floats(width: int) -> ir.Type:
 
 
 def whole_type(a: Any) -> ir.Type:
-    """Return the integer vector type with as many elements as an LLVM vector."""
+    """Return the int32 vector type with as many elements as the LLVM vector `a`."""
     return ir.VectorType(_INT, a.type.count)
 
 
-#: Numba type of a vector of sixteen numbers.
+#: Numba type of a vector of sixteen float32 numbers.
 SIXTEEN = _lanes(WIDE)
 _eight = _lanes(LANES)
 _triple, _four = (cast("Any", types).UniTuple(_eight, count) for count in (3, 4))
@@ -98,7 +101,10 @@ class _MaskModel(models.PrimitiveModel):
 
 
 class Site(NamedTuple):
-    """The call site of a function: Numba's context, LLVM's builder, the operands' Numba types."""
+    """The place where a function is called.
+
+    A `Site` contains Numba's context, LLVM's builder, and the Numba types of the operands.
+    """
 
     context: Any
     builder: Any
@@ -106,13 +112,15 @@ class Site(NamedTuple):
 
 
 def emitted(emit: Callable[..., Any], result: Any, *operands: Any) -> Any:
-    """Make a function for kernels.
+    """Create a function that kernels can call.
 
     Args:
-        emit: Emits the instructions from the `Site` and the operands' LLVM values.
-        result: Numba type of the result, such as `SIXTEEN`. `_lanes` and `_mask` stand for a vector
-            of the same width as the operands' vectors.
-        operands: Numba types of the operands, in the same form; None means any array.
+        emit: Function that emits the instructions. The function receives the `Site` and the
+            operands' LLVM values.
+        result: Numba type of the result, such as `SIXTEEN`. `_lanes` and `_mask` mean a vector with
+            as many lanes as the operands' vectors.
+        operands: Numba types of the operands, also with `_lanes` and `_mask`. An operand type of
+            None means any array.
     """
 
     def define(*given: Any) -> Any:
@@ -131,7 +139,8 @@ def emitted(emit: Callable[..., Any], result: Any, *operands: Any) -> Any:
 
         return typed(result, None)(*kinds), generate
 
-    # Numba reads the number of operands from the signature of the function.
+    # Numba reads the number of operands from the Python signature, so each number needs its own
+    # function.
     by_count: dict[int, Callable[..., Any]] = {
         0: lambda typing: define(),
         1: lambda typing, a: define(a),
@@ -144,10 +153,11 @@ def emitted(emit: Callable[..., Any], result: Any, *operands: Any) -> Any:
 
 
 def _define(sign: Callable[[Any, Any], Any], emit: Callable[..., Any], kind: Any, to: Any) -> None:
-    """Define a Python operator for two values of one kind."""
+    """Define a Python operator for two vectors of the type `kind`."""
     implementation = emitted(emit, to, kind, kind)
 
-    @overload(sign, strict=False)  # The annotations are not part of the signature
+    # Without `strict=False`, Numba would compare the annotations with the signature.
+    @overload(sign, strict=False)
     def _overloaded(a: Any, b: Any) -> Any:
         if isinstance(a, kind) and a == b:
             return lambda a, b: implementation(a, b)  # noqa: PLW0108 - Numba compiles the lambda
@@ -165,7 +175,10 @@ _define(operator.and_, lambda at, a, b: at.builder.and_(a, b), _mask, _mask)
 
 
 def _llvm(name: str, result: ir.Type | None = None) -> Callable[..., Any]:
-    """Emit a call of an LLVM intrinsic; without a result type, it is a vector intrinsic."""
+    """Return a function that emits a call of an LLVM intrinsic.
+
+    If `result` is None, the intrinsic works on float32 vectors.
+    """
 
     def emit(at: Site, *args: Any) -> Any:
         full = name if result else f"{name}.v{args[0].type.count}f32"
@@ -179,13 +192,16 @@ def _llvm(name: str, result: ir.Type | None = None) -> Callable[..., Any]:
 
 
 def _element(at: Site, array: Any, index: Any, kind: ir.Type) -> Any:
-    """Return the address of an array's element; without bounds check or negative indices."""
+    """Return the address of an array element. The index is not checked and must not be negative."""
     data = at.context.make_array(at.operands[0])(at.context, at.builder, array).data
     return at.builder.bitcast(at.builder.gep(data, [index]), kind.as_pointer())
 
 
 def shuffled(at: Site, a: Any, b: Any, order: Sequence[int]) -> Any:
-    """Return chosen lanes of `a` and `b`; lane numbers of `b` follow the numbers of `a`."""
+    """Return the lanes of `a` and `b` in the order `order`.
+
+    Lanes of `b` are numbered after the lanes of `a`.
+    """
     places = ir.Constant(ir.VectorType(_INT, len(order)), list(order))
     return at.builder.shuffle_vector(a, b, places)
 
@@ -222,10 +238,10 @@ def _broadcast_four(width: int) -> Callable[..., Any]:
 
 
 def picking(order: Sequence[int]) -> Callable[[Lanes, Lanes], Lanes]:
-    """Make a function that returns lanes of two vectors of sixteen in a fixed order.
+    """Create a function that selects lanes from two vectors of sixteen lanes in a fixed order.
 
     Args:
-        order: Sixteen lane numbers; lanes of the second vector start at 16.
+        order: Sixteen lane numbers; numbers from 16 on select lanes of the second vector.
     """
     pick = emitted(lambda at, a, b: shuffled(at, a, b, order), SIXTEEN, SIXTEEN, SIXTEEN)
     return cast("Callable[[Lanes, Lanes], Lanes]", pick)
@@ -267,14 +283,15 @@ def _store_triples(at: Site, array: Any, index: Any, x: Any, y: Any, z: Any) -> 
 
 
 def _parts(at: Site, array: Any, index: Any, count: int = 3) -> list[Any]:
-    """Return the addresses of consecutive vectors of eight."""
+    """Return the addresses of `count` consecutive vectors of eight lanes."""
     places = [at.builder.add(index, ir.Constant(index.type, i * LANES)) for i in range(count)]
     return [_element(at, array, start, _floats(LANES)) for start in places]
 
 
 def _prefetch(at: Site, array: Any, index: Any, *, write: int) -> Any:
     address = _element(at, array, index, _BYTE)
-    # The cache line stays in all cache levels (3). It contains data, not instructions (1).
+    # Argument 3: keep the cache line in all cache levels. Argument 1: the cache line contains data,
+    # not instructions.
     _llvm("llvm.prefetch.p0", ir.VoidType())(at, address, _INT(write), _INT(3), _INT(1))
     return at.context.get_dummy_value()
 
@@ -310,7 +327,8 @@ def _scale_by_power(at: Site, value: Any, shifted: Any) -> Any:
 def _sums(at: Site, *args: Any) -> Any:
     rows = list(args)
     for width in (1, 2, 4):
-        # Add groups of `width` lanes to the neighbouring groups. Two vectors become one.
+        # Add each group of `width` lanes to its neighbouring group. Each pair of vectors becomes
+        # one vector.
         starts = [s + o for s in range(0, LANES, 2 * width) for o in (0, LANES)]
         low = [start + lane for start in starts for lane in range(width)]
         high = [lane + width for lane in low]
@@ -335,34 +353,34 @@ _Array = NDArray[Any]
 _Three = tuple[Lanes, Lanes, Lanes]
 _Four = tuple[Lanes, Lanes, Lanes, Lanes]
 
-#: Return a float32 number in all lanes.
+#: Return a vector with the float32 number in all eight lanes.
 splat: Callable[[np.float32], Lanes] = emitted(_splat(LANES), _eight, types.float32)
-#: Return (0, 1, ..., 7).
+#: Return the vector (0, 1, ..., 7).
 ramp: Callable[[], Lanes] = emitted(_ramp(LANES), _eight)
-#: Return eight consecutive numbers of a flat float32 array, starting at an index.
+#: Return eight consecutive numbers of a one-dimensional float32 array, starting at an index.
 load: Callable[[_Array, int], Lanes] = emitted(_load(LANES), _eight, None, types.intp)
-#: Return one number of a flat float32 array in all lanes.
+#: Return one number of a one-dimensional float32 array in all eight lanes.
 broadcast: Callable[[_Array, int], Lanes] = emitted(_broadcast(LANES), _eight, None, types.intp)
-#: Return four consecutive numbers of a flat float32 array in lanes 0 to 3, and again in lanes 4 to
-#: 7.
+#: Return four consecutive numbers of a one-dimensional float32 array in lanes 0 to 3, and again in
+#: lanes 4 to 7.
 broadcast_four: Callable[[_Array, int], Lanes] = emitted(
     _broadcast_four(LANES), _eight, None, types.intp
 )
-#: Return a float32 number in sixteen lanes.
+#: Return a vector with the float32 number in all sixteen lanes.
 splat_wide: Callable[[np.float32], Lanes] = emitted(_splat(WIDE), SIXTEEN, types.float32)
-#: Return (0, 1, ..., 15).
+#: Return the vector (0, 1, ..., 15).
 ramp_wide: Callable[[], Lanes] = emitted(_ramp(WIDE), SIXTEEN)
-#: Return sixteen consecutive numbers of a flat float32 array, starting at an index.
+#: Return sixteen consecutive numbers of a one-dimensional float32 array, starting at an index.
 load_wide: Callable[[_Array, int], Lanes] = emitted(_load(WIDE), SIXTEEN, None, types.intp)
-#: Return one number of a flat float32 array in sixteen lanes.
+#: Return one number of a one-dimensional float32 array in all sixteen lanes.
 broadcast_wide: Callable[[_Array, int], Lanes] = emitted(
     _broadcast(WIDE), SIXTEEN, None, types.intp
 )
-#: Return four consecutive numbers of a flat float32 array in each group of four lanes.
+#: Return four consecutive numbers of a one-dimensional float32 array in each group of four lanes.
 broadcast_four_wide: Callable[[_Array, int], Lanes] = emitted(
     _broadcast_four(WIDE), SIXTEEN, None, types.intp
 )
-#: Return the lanes of two vectors of eight lanes, first one vector, then the other.
+#: Join two vectors of eight lanes to one vector of sixteen lanes.
 joined: Callable[[Lanes, Lanes], Lanes] = emitted(
     lambda at, a, b: shuffled(at, a, b, range(WIDE)), SIXTEEN, _eight, _eight
 )
@@ -374,52 +392,55 @@ first_half: Callable[[Lanes], Lanes] = emitted(
 last_half: Callable[[Lanes], Lanes] = emitted(
     lambda at, a: shuffled(at, a, a, range(LANES, WIDE)), _eight, SIXTEEN
 )
-#: Return the sum of the first eight and the last eight of sixteen lanes.
+#: Add the first eight lanes to the last eight of sixteen lanes; the result has eight lanes.
 halves_added: Callable[[Lanes], Lanes] = emitted(_halves_added, _eight, SIXTEEN)
-#: Return eight consecutive triples of a contiguous float32 array, such as pixels, as three vectors,
-#: starting at a flat index.
+#: Load eight consecutive triples, such as RGB pixels, from a contiguous float32 array. Return one
+#: vector for each of the three components.
 load_triples: Callable[[_Array, int], _Three] = emitted(_load_triples, _triple, None, types.intp)
-#: Return eight consecutive groups of four numbers, such as quaternions, as four vectors.
+#: Load eight consecutive groups of four numbers, such as quaternions. Return one vector for each of
+#: the four components.
 load_fours: Callable[[_Array, int], _Four] = emitted(_load_fours, _four, None, types.intp)
-#: Write eight consecutive triples from three vectors, starting at a flat index.
+#: Store three vectors as eight consecutive triples; the index counts single numbers.
 store_triples: Callable[[_Array, int, Lanes, Lanes, Lanes], None] = emitted(
     _store_triples, types.void, None, types.intp, _eight, _eight, _eight
 )
-#: Write consecutive numbers to a flat float32 array, starting at an index.
+#: Store a vector in a one-dimensional float32 array, starting at an index.
 store: Callable[[_Array, int, Lanes], None] = emitted(_store, types.void, None, types.intp, _lanes)
-#: Prefetch the cache line of an element of a contiguous array, given a flat index.
+#: Prefetch the cache line of an element of a contiguous array; the index counts single numbers.
 prefetch: Callable[[_Array, int], None] = emitted(
     lambda at, array, index: _prefetch(at, array, index, write=0), types.void, None, types.intp
 )
-#: Like `prefetch`, for an element that will be written.
+#: Like `prefetch`, but for an element that will be written.
 prefetch_write: Callable[[_Array, int], None] = emitted(
     lambda at, array, index: _prefetch(at, array, index, write=1), types.void, None, types.intp
 )
-#: Return a b + c, rounded once if the machine supports it.
+#: Return a b + c. The result is rounded only once if the machine has a fused multiply-add
+#: instruction.
 fma: Callable[[Lanes, Lanes, Lanes], Lanes] = emitted(
     _llvm("llvm.fmuladd"), _lanes, _lanes, _lanes, _lanes
 )
-#: Return c - a b, rounded once if the machine supports it.
+#: Return c - a b. The result is rounded only once if the machine has a fused multiply-add
+#: instruction.
 fnma: Callable[[Lanes, Lanes, Lanes], Lanes] = emitted(_negated_fma, _lanes, _lanes, _lanes, _lanes)
-#: Return the square roots.
+#: Return the square root of each lane.
 square_root: Callable[[Lanes], Lanes] = emitted(_llvm("llvm.sqrt"), _lanes, _lanes)
-#: Round up to whole numbers.
+#: Round each lane up to a whole number.
 round_up: Callable[[Lanes], Lanes] = emitted(_llvm("llvm.ceil"), _lanes, _lanes)
-#: Round down to whole numbers.
+#: Round each lane down to a whole number.
 round_down: Callable[[Lanes], Lanes] = emitted(_llvm("llvm.floor"), _lanes, _lanes)
-#: Return the absolute values.
+#: Return the absolute value of each lane.
 magnitude: Callable[[Lanes], Lanes] = emitted(_llvm("llvm.fabs"), _lanes, _lanes)
-#: Return the negated absolute values.
+#: Return the negative absolute value of each lane.
 as_negative: Callable[[Lanes], Lanes] = emitted(_as_negative, _lanes, _lanes)
-#: Return the smaller number of each pair; if one is NaN, return the second number.
+#: Return the smaller number in each lane. If a number is NaN, return the second number.
 smaller: Callable[[Lanes, Lanes], Lanes] = emitted(_pick("<"), _lanes, _lanes, _lanes)
-#: Return the larger number of each pair; if one is NaN, return the second number.
+#: Return the larger number in each lane. If a number is NaN, return the second number.
 larger: Callable[[Lanes, Lanes], Lanes] = emitted(_pick(">"), _lanes, _lanes, _lanes)
-#: Return the first number if the mask is true, else the second number.
+#: In each lane, return the first number if the mask is True, else the second number.
 where: Callable[[Mask, Lanes, Lanes], Lanes] = emitted(
     lambda at, mask, a, b: at.builder.select(mask, a, b), _lanes, _mask, _lanes, _lanes
 )
-#: Return the mask as a number, with lane 0 in the lowest bit.
+#: Return the mask as an integer; the lowest bit belongs to lane 0.
 bits: Callable[[Mask], np.uint64] = emitted(_bits, types.uint64, _mask)
 #: Return the position of the lowest set bit, or 64 for zero.
 lowest_bit: Callable[[np.uint64], int] = emitted(
@@ -430,19 +451,24 @@ lowest_bit: Callable[[np.uint64], int] = emitted(
 count_bits: Callable[[np.uint64], int] = emitted(
     _llvm("llvm.ctpop.i64", _LONG), types.int64, types.uint64
 )
-#: Return value * 2**n if the second vector is n + 1.5 * 2**23, whose lowest bits contain n.
+#: Return value * 2^n. The second vector must contain n + 1.5 * 2^23, because the lowest bits of
+#: this float32 number are n.
 scale_by_power: Callable[[Lanes, Lanes], Lanes] = emitted(_scale_by_power, _lanes, _lanes, _lanes)
-#: Return the sums over the lanes of eight vectors, in their order. The lanes are added in pairs.
+#: Return a vector of eight sums: lane i contains the sum over all lanes of vector i. Lanes are
+#: added in pairs.
 sums: Callable[[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes], Lanes] = emitted(
     _sums, _eight, *([_eight] * LANES)
 )
-#: Return the sum over the lanes, which are added in pairs.
+#: Return the sum over all eight lanes. Lanes are added in pairs.
 total: Callable[[Lanes], np.float32] = emitted(_total, types.float32, _eight)
 
 
 @strict_device
 def aligned(count: int) -> NDArray[np.float32]:
-    """Return an array of `count` numbers aligned to cache lines, so no vector spans two lines."""
+    """Return an array of `count` numbers that is aligned to cache lines.
+
+    No vector in the array spans two cache lines.
+    """
     room = np.empty(count + WIDE, np.float32)
     shift = (-(room.ctypes.data // room.itemsize)) % WIDE
     return room[shift : shift + count]

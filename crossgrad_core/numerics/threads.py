@@ -1,4 +1,4 @@
-"""The number of threads, set in one place for Numba and torch."""
+"""Set the number of threads for both Numba and torch."""
 
 import os
 from collections.abc import Iterator
@@ -12,24 +12,25 @@ from crossgrad_core.system.cores import available_cores
 
 
 def configure_threads(n: int | None = None) -> int:
-    """Set the same number of threads for Numba's kernels and torch's operators.
+    """Set the number of threads for Numba's kernels and torch's operators.
 
-    Kernels divide their work with `jobs.parallel`. For the `prange` loops of plugins, Numba's
-    threading layer is set to OpenMP if it can be loaded, else TBB, else Numba's own "workqueue".
-    The layer is not changed if the environment names a layer (`NUMBA_THREADING_LAYER`,
-    `NUMBA_THREADING_LAYER_PRIORITY`) or if a parallel kernel has already run. Numba's number of
-    threads belongs to the calling thread, so every other thread that runs kernels must also call
-    this function. After the call, freed memory stays in the process (`keep_freed_memory`).
+    Kernels of crossgrad divide their work with `jobs.parallel`. Plugins may use `prange` loops. For
+    these loops, Numba uses OpenMP if OpenMP can be loaded, else TBB, else its own "workqueue". The
+    choice of the threading layer is left to the environment if `NUMBA_THREADING_LAYER` or
+    `NUMBA_THREADING_LAYER_PRIORITY` is set. After the first parallel kernel, the threading layer
+    cannot change any more. Numba stores the number of threads for each calling thread. Every other
+    thread that runs kernels must also call this function. After the call, freed memory stays in the
+    process (see `keep_freed_memory`).
 
     Args:
-        n: Number of threads; None uses NUMBA_NUM_THREADS or OMP_NUM_THREADS if one is set, else
-            the cores available to this process (its affinity and, in a container, CPU quota).
+        n: Number of threads. None uses NUMBA_NUM_THREADS or OMP_NUM_THREADS if one is set, else the
+            number of available cores.
 
     Returns:
-        The number of threads that was set.
+        The number of threads that is now set.
 
     Raises:
-        UserError: If `n` is below 1 or above Numba's limit at its start.
+        UserError: `n` is below 1, or above Numba's limit when the process started.
     """
     import numba
 
@@ -53,7 +54,10 @@ def configure_threads(n: int | None = None) -> int:
 
 
 def _prefer_openmp() -> None:
-    """Put OpenMP first among the threading layers; no effect after a layer has started."""
+    """Let Numba prefer OpenMP as its threading layer.
+
+    The call has no effect after a layer has started.
+    """
     import numba
 
     if not {"NUMBA_THREADING_LAYER", "NUMBA_THREADING_LAYER_PRIORITY"} & os.environ.keys():
@@ -71,7 +75,7 @@ def _default_threads() -> int:
 
 @contextmanager
 def on_one_thread() -> Iterator[None]:
-    """Run Numba and torch on one thread inside the block, for little work."""
+    """Inside the block, run Numba and torch on one thread, for small amounts of work."""
     import numba
 
     before = numba.get_num_threads(), torch.get_num_threads()

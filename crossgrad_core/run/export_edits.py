@@ -62,13 +62,13 @@ class Crop:
         return cls(polygon=np.array(corners))
 
     def inside(self, points: NDArray[np.float64], up: str) -> NDArray[np.bool_]:
-        """Return [N] bool, True for the points [N, 3] inside; `up` is the axis that points up."""
+        """Return a mask [N] of the points [N, 3] inside the crop region; `up` is the up axis."""
         if self.box is not None:
             return np.asarray(((points >= self.box[0]) & (points <= self.box[1])).all(axis=1))
         assert self.polygon is not None
         x, y = (points[:, [0, 2]] if up == "y" else points[:, :2]).T
         inside = np.zeros(len(points), dtype=np.bool_)
-        # A point is inside if a ray along x crosses an odd number of edges.
+        # A point is inside the polygon if its ray along x crosses an odd number of polygon edges.
         for (x0, y0), (x1, y1) in zip(self.polygon, np.roll(self.polygon, -1, axis=0), strict=True):
             if y0 != y1:
                 crosses = (y0 > y) != (y1 > y)

@@ -249,7 +249,9 @@ def operator_of(config: RunConfig) -> tuple[Operator, str]:
 
 
 def views_per_step_of(config: RunConfig) -> tuple[ViewsPerStepSpec, str]:
-    """Return K of each step, and the reason if K differs from the sampler's default; else empty.
+    """Return the number of views K of each step, and a reason.
+
+    The reason is empty, except if the operator changes the sampler's default K.
 
     If the user sets no K, K is the sampler's default. If the operator does not work with this K, K
     is the smallest number that both components support.

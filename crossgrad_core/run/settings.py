@@ -155,7 +155,9 @@ def _flat(layer: Mapping[str, object]) -> Settings:
 
 
 def _places(options: Mapping[str, object]) -> dict[tuple[str, ...], object]:
-    """Return path of a setting -> the user's value, without None and empty lists.
+    """Return a dict from the path of each setting to the user's value.
+
+    Values of None and empty lists are left out.
 
     Raises:
         UserError: A value is not a rule, or the same rule is both added and removed.
@@ -183,7 +185,9 @@ def _places(options: Mapping[str, object]) -> dict[tuple[str, ...], object]:
 
 
 def _rules(option: str, value: object) -> Mapping[str, object]:
-    """Return name of a rule -> its options, True to use it, or False to leave it out.
+    """Return a dict from the name of each rule to its options, True or False.
+
+    True selects the rule with its default options. False removes the rule.
 
     Raises:
         UserError: A value is not a rule.

@@ -1,4 +1,4 @@
-"""Scenes: cameras, photos, SfM points, and the similarity back to the input frame."""
+"""Scenes: cameras, photos, SfM points, and the similarity transform to the input frame."""
 
 from crossgrad_core.contract.georeference import Similarity
 from crossgrad_core.contract.scene import Camera, Photo, Scene, View

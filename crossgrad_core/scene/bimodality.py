@@ -1,4 +1,4 @@
-"""Sarle's bimodality coefficient."""
+"""Sarle's bimodality coefficient, which tells whether values form one or two clusters."""
 
 from dataclasses import dataclass
 from math import sqrt
@@ -7,29 +7,31 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-#: The bimodality coefficient of a uniform sample, rounded down. Samples below this value have one
-#: mode.
+#: The bimodality coefficient of a uniform distribution (5/9), rounded down. A sample with a smaller
+#: coefficient counts as a single cluster.
 ONE_MODE: Final = 0.555
-#: Smallest sample for which the finite-sample kurtosis is defined.
+#: Smallest sample size for which the finite-sample kurtosis is defined.
 _SMALLEST = 4
-#: Minimum sample size. In a smaller sample with values at only two points, the finite-sample
-#: coefficient stays below the value of a uniform sample (docs/groupings.md).
+#: Smallest sample size for which the finite-sample form is used. In smaller samples, even two
+#: separate values give a coefficient below the value of a uniform distribution (docs/groupings.md).
 _SMALLEST_SAMPLE = 10
 
 
 @dataclass(frozen=True)
 class Bimodality:
-    """Sarle's coefficient of one sample.
+    """Sarle's bimodality coefficient of a sample, in two forms.
 
-    For orientation: the coefficient is 1/3 for a normal distribution, 5/9 for a uniform
-    distribution, and 1 for any distribution on two points. Skewness alone reaches 5/9 (exponential
-    distribution). The finite-sample form is always below 1: two equally populated points give 0.566
-    at n = 10 and 0.951 at n = 100. Therefore, n must be reported with the coefficient.
+    Typical values are 1/3 for a normal distribution, 5/9 for a uniform distribution, and 1 for a
+    distribution on two points. A skewed distribution with a single mode can also reach 5/9, for
+    example the exponential distribution. The finite-sample form is always below 1. Two equally
+    frequent values give 0.566 for n = 10 and 0.951 for n = 100. A report of the coefficient must
+    therefore include the sample size n.
 
     Attributes:
-        sample: Finite-sample form with Fisher's G1 and G2; NaN if undefined.
-        population: Form with plain moments, (g1^2 + 1) / (g2 + 3); NaN if undefined.
-        size: n.
+        sample: Finite-sample form with Fisher's skewness G1 and kurtosis G2; NaN if undefined.
+        population: Form with the moments of the sample, (g1^2 + 1) / (g2 + 3) for skewness g1 and
+            excess kurtosis g2; NaN if undefined.
+        size: Sample size n.
         reason: Why a form is NaN; empty if both forms are defined.
     """
 
@@ -40,12 +42,12 @@ class Bimodality:
 
     @property
     def deciding(self) -> float:
-        """The form used for decisions: finite-sample, or plain moments for small samples."""
+        """The form that decisions use: `sample`, but `population` for small samples."""
         return self.sample if self.size >= _SMALLEST_SAMPLE else self.population
 
 
 def bimodality(values: NDArray[np.float64]) -> Bimodality:
-    """Compute Sarle's coefficient of the values [n] in both forms.
+    """Return Sarle's bimodality coefficient of the values [n], in both forms.
 
     Source: SAS/STAT user's guide, CLUSTER procedure (Sarle); Pfister et al. 2013.
     """
@@ -55,7 +57,7 @@ def bimodality(values: NDArray[np.float64]) -> Bimodality:
         return Bimodality(float("nan"), float("nan"), size, reason)
     deviations = values - values.mean()
     spread = float(np.abs(deviations).max())
-    # If all values are equal, the deviations can still be non-zero, because the mean is rounded.
+    # Rounding of the mean can make deviations non-zero even if all values are equal.
     if spread <= 4.0 * np.finfo(np.float64).eps * float(np.abs(values).max()):
         return Bimodality(float("nan"), float("nan"), size, "all values are equal")
     scaled = deviations / spread

@@ -1,4 +1,4 @@
-"""Conversion of a reader's raw scene to a `Scene`: checks, photos, split, frame, regimes."""
+"""Convert a reader's raw scene to a `Scene`: checks, photos, split, local frame and regimes."""
 
 import logging
 from collections import Counter
@@ -36,21 +36,23 @@ from crossgrad_core.system.input_files import is_file
 from crossgrad_core.wording import one_line
 
 _LOG = logging.getLogger(__name__)
-#: If at least this share of the stored pixels is unmasked, some unmasked pixels remain after every
-#: later step. Below this share, undistorting and resizing could remove all of them, so the photo is
-#: decoded to check.
+#: If at least this share of a photo's stored pixels is valid, undistortion and resizing cannot
+#: remove all valid pixels. Below this share, the photo is decoded to check whether valid pixels
+#: remain.
 _SURE = 0.05
 _HALF = 128
 
 
 def without_blank_photos(split: Split, sources: Mapping[str, PhotoSource], root: Path) -> Split:
-    """Return the split without training photos that are masked completely; a note names them.
+    """Return the split without training photos whose pixels are all masked.
 
-    This reads masks and decodes photos with transparency. Held-out photos stay in the split: their
-    metrics report that no pixel counts.
+    A note names the removed photos.
+
+    The function reads masks and decodes photos with transparency. Held-out photos stay in the
+    split. The metrics of a held-out photo that is masked completely report that no pixel is valid.
 
     Raises:
-        UserError: No training photo has a pixel that counts.
+        UserError: No training photo has a valid pixel.
     """
     doubtful = [name for name in split.train if _can_be_blank(sources[name])]
     with ThreadPoolExecutor() as pool:
@@ -80,7 +82,7 @@ def _is_blank(source: PhotoSource) -> bool:
 
 
 def _counting_shares(source: PhotoSource) -> list[float]:
-    """Return the shares of the stored pixels that count by the mask and by transparency."""
+    """Return the shares of the stored pixels that the mask and the transparency mark as valid."""
     shares = [1.0]
     if source.mask is not None:
         shares.append(float((decode_mask(source.mask) > 0).mean()))
@@ -102,14 +104,17 @@ def _all_blank(names: Sequence[str], root: Path) -> UserError:
 
 
 def with_points_of_file(raw: RawScene, option: Path | None) -> RawScene:
-    """Replace the points of a scene by the points of a file, without observations by photos.
+    """Replace the points of a scene by the points of a file.
+
+    The photos of the result have no observations of points.
 
     Args:
         raw: The scene from the reader.
-        option: The file, as given or relative to the scene; None keeps the points of the reader.
+        option: The point file, as a path or relative to the scene; None keeps the points of the
+            reader.
 
     Raises:
-        UserError: The file does not exist, cannot be read, contains Gaussians, or is in another
+        UserError: The file does not exist, cannot be read, contains Gaussians, or uses another
             coordinate frame than the cameras.
     """
     if option is None:
@@ -149,14 +154,17 @@ def with_points_of_file(raw: RawScene, option: Path | None) -> RawScene:
 
 
 NEAR, FAR = "near", "far"
-# Label of the photos directly in the image folder, if other photos are in subfolders.
+# Label of photos that are directly in the image folder while other photos are in subfolders.
 _TOP = "images"
 # Label of all views if near and far views cannot be distinguished.
 _ONLY = "all"
 
 
 def label_by_folder(names: Sequence[str]) -> tuple[str, ...] | None:
-    """Label names by the first folder in which they differ; None if all are in one folder."""
+    """Label photos by the first folder in which their paths differ.
+
+    Return None if all photos are in one folder.
+    """
     folders = [PurePosixPath(name).parent.parts for name in names]
     shared = 0
     while len({parts[: shared + 1] for parts in folders}) == 1:
@@ -172,17 +180,19 @@ def label_by_footprint(
     points: NDArray[np.float64],
     train: Sequence[int],
 ) -> tuple[str, ...]:
-    """Label a view near if its footprint is at least the median of the training views, else far.
+    """Label views as near or far by their footprints.
 
-    The footprint is defined in `contract.scene.footprint`. A view without a footprint uses the
-    footprint of the nearest camera that has one. If no view has a footprint, every view gets the
-    label `all`.
+    The threshold is the median over the training views.
+
+    A view is near if its footprint is at least the median. `contract.scene.footprint` defines the
+    footprint. A view without a footprint uses the footprint of the nearest camera that has a
+    footprint. If no view has a footprint, all views get the label `all`.
 
     Args:
-        cameras: Cameras of all views, local frame.
-        seen: Rows of `points` that each view observed.
-        points: [P, 3], local frame.
-        train: Indices of the training views, over which the median is computed.
+        cameras: Cameras of all views, in the local frame.
+        seen: For each view, the rows of `points` that the view observes.
+        points: [P, 3] SfM points, in the local frame.
+        train: Positions of the training views; the median is computed over these views.
     """
     footprints = np.array(
         [footprint(camera, points, rows) for camera, rows in zip(cameras, seen, strict=True)]
@@ -200,14 +210,16 @@ def label_by_footprint(
 
 
 def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
-    """Build the scene for training from a raw scene.
+    """Build the scene for training from the raw scene of a reader.
 
-    Leaves out views without a photo, views in neither split list, and completely masked training
-    views. The local frame is computed from the training cameras. Nothing is written to disk. A
-    photo is decoded only if its mask or transparency may exclude all of its pixels.
+    The scene does not include views without a photo, views that no split list contains, and
+    training views that are masked completely. The local frame is computed from the training
+    cameras. The function writes nothing to disk. A photo is decoded only if its mask or
+    transparency may hide all of its pixels.
 
     Raises:
-        UserError: The input cannot be used for training. The message gives cause, place and remedy.
+        UserError: The input cannot be used for training. The message names the cause, the file and
+            the remedy.
     """
     raw = with_photo_names(raw)
     check_views(raw)
@@ -267,7 +279,10 @@ def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
 
 
 def _labels(raw: RawScene, photos: ChosenPhotos, points: CheckedPoints) -> Label:
-    """Return a labeller that works before the split, in a local frame of all cameras."""
+    """Return a function that labels views before the split is known.
+
+    The function uses a local frame of all cameras.
+    """
     views = sorted((v for v in raw.views if v.name in photos.sources), key=lambda view: view.name)
     names = [view.name for view in views]
 
@@ -321,7 +336,7 @@ def _note_regimes(regimes: Sequence[str], train: Sequence[int], how: str) -> str
 def _note_unmeasured(
     regimes: Sequence[str], train: Sequence[int], options: SceneOptions
 ) -> Iterator[str]:
-    """Yield a note on the regimes without a held-out photo, if other regimes have one."""
+    """Yield a note about regimes without held-out photos, if another regime has held-out photos."""
     held_out = Counter(regimes) - Counter(regimes[i] for i in train)
     lacking = sorted(set(regimes) - set(held_out))
     if held_out and lacking:

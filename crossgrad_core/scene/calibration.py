@@ -1,4 +1,4 @@
-"""Camera calibrations in COLMAP's terms, and their undistortion with pycolmap."""
+"""Camera calibrations in COLMAP's models, and undistortion of their photos with pycolmap."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,16 +15,17 @@ from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
 if TYPE_CHECKING:
     import pycolmap
 
-# These models are pinhole cameras if all distortion parameters are 0. Fisheye models are not in the
-# list: with zero parameters they are equidistant, although pycolmap's `is_undistorted` is True.
+# Camera models that are pinhole cameras if all their distortion parameters are 0. Fisheye models
+# are not listed. With zero parameters, fisheye models use an equidistant projection, although
+# pycolmap's `is_undistorted` is True.
 _PINHOLE_AT_ZERO = frozenset(
     {"SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION", "DIVISION"}
 )
 _PINHOLE = frozenset({"SIMPLE_PINHOLE", "PINHOLE"})
-# Models of photos that cover all directions.
+# Models of panorama photos, which cover all directions.
 _ALL_AROUND = frozenset({"EQUIRECTANGULAR"})
-# Cameras beyond these limits cannot be computed in single precision.
-_LONGEST_SIDE = 10_000_000  # pixels
+# Cameras with values beyond these limits cause overflow in single precision.
+_LONGEST_SIDE = 10_000_000  # Number of pixels.
 _LARGEST_PARAMETER, _SHORTEST_FOCAL = 1e12, 1e-6
 _WHITE = 255
 _AGAIN = "correct the camera, or export the model again"
@@ -32,13 +33,13 @@ _AGAIN = "correct the camera, or export the model again"
 
 @dataclass(frozen=True)
 class Calibration:
-    """A camera model of COLMAP with its parameters.
+    """A camera model of COLMAP together with its parameters.
 
     Attributes:
         model: COLMAP's name of the model, such as `PINHOLE` or `OPENCV`.
-        width: Width of the photos used for calibration, pixels.
-        height: Height of the photos used for calibration, pixels.
-        params: In COLMAP's order for the model.
+        width: Width of the calibration photos, in pixels.
+        height: Height of the calibration photos, in pixels.
+        params: Parameters of the model, in COLMAP's order.
     """
 
     model: str
@@ -47,11 +48,12 @@ class Calibration:
     params: tuple[float, ...]
 
     def check(self, where: object) -> None:
-        """Refuse a calibration that no photo can have.
+        """Raise an error if the calibration is not valid.
 
         Raises:
-            UserError: Unknown model, wrong number of parameters, empty size, a focal length that is
-                not positive, or a value that is not finite. The message names `where`.
+            UserError: The model is unknown, the number of parameters is wrong, the size is empty, a
+                focal length is not positive, or a value is not finite. The message names `where`,
+                the source of the calibration.
         """
         if min(self.width, self.height) < 1 or max(self.width, self.height) > _LONGEST_SIDE:
             raise UserError(
@@ -89,7 +91,7 @@ class Calibration:
                 found=str(len(self.params)),
                 todo=_AGAIN,
             )
-        # This is also False for NaN.
+        # The comparison is also False for NaN.
         if not all(abs(value) <= _LARGEST_PARAMETER for value in self.params):
             raise UserError(
                 "a camera parameter is not a finite number",
@@ -110,7 +112,7 @@ class Calibration:
 
     @property
     def is_pinhole(self) -> bool:
-        """True if the photos need no undistortion."""
+        """True if photos with this calibration need no undistortion."""
         if self.model in _PINHOLE:
             return True
         extra = [self.params[i] for i in self._camera.extra_params_idxs()]
@@ -118,11 +120,11 @@ class Calibration:
 
     @property
     def without_distortion(self) -> Pinhole:
-        """The pinhole camera with the same focal lengths and principal point."""
+        """The pinhole camera with the focal lengths and the principal point of this calibration."""
         return self._read_pinhole(self._camera)
 
     def resized(self, width: int, height: int) -> "Calibration":
-        """Return the calibration of the same photos resampled to `width` x `height`."""
+        """Return the calibration for photos that are resampled to `width` x `height`."""
         if (width, height) == (self.width, self.height):
             return self
         if self.is_pinhole:
@@ -135,10 +137,10 @@ class Calibration:
 
     @cached_property
     def pinhole(self) -> Pinhole:
-        """The calibration after undistortion; size and principal point may differ.
+        """The pinhole camera after undistortion. Image size and principal point may change.
 
         Raises:
-            UserError: The model has no pinhole equivalent.
+            UserError: The model cannot be converted to a pinhole camera.
         """
         if self.is_pinhole:
             return self.without_distortion
@@ -153,7 +155,7 @@ class Calibration:
 
     @cached_property
     def fills_frame(self) -> bool:
-        """True if the distorted photo covers every pixel of the undistorted photo."""
+        """True if every pixel of the undistorted photo has a source in the distorted photo."""
         if self.is_pinhole:
             return True
         frame = self.pinhole
@@ -162,21 +164,23 @@ class Calibration:
         rows = [np.stack([u, np.full_like(u, y)], 1) for y in (v[0], v[-1])]
         columns = [np.stack([np.full_like(v, x), v], 1) for x in (u[0], u[-1])]
         plane = (np.concatenate(rows + columns) - [frame.cx, frame.cy]) / [frame.fx, frame.fy]
-        # Bilinear interpolation needs a neighbouring pixel centre on each side.
+        # Bilinear interpolation needs pixel centres on both sides of a position.
         pixels = source_pixels(self._camera, plane) - 0.5
         inside = (pixels >= 0) & (pixels <= [self.width - 1, self.height - 1])
         return bool(inside.all() and not self._reach.beyond(plane).any())
 
     @cached_property
     def cost(self) -> LensCost | None:
-        """The losses of undistortion; None for a pinhole camera."""
+        """The loss of image content by undistortion; None for a pinhole camera."""
         return None if self.is_pinhole else cost_of(self._camera, self._reach, self.pinhole)
 
     def undistort(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Undistort a photo to the pixels of `pinhole`, bilinear; pixels without source are black.
+        """Undistort a photo to the pixels of `pinhole` by bilinear interpolation.
+
+        Pixels without a source become black.
 
         Args:
-            image: [H, W, 3] or [H, W], in the size of the calibration.
+            image: [H, W, 3] or [H, W] photo, in the size of the calibration.
         """
         guard_pycolmap()
         import pycolmap
@@ -188,7 +192,11 @@ class Calibration:
         return np.asarray(bitmap.to_array())[top:bottom, left:right]
 
     def reached(self) -> NDArray[np.bool_]:
-        """Return a mask [H, W] of the `pinhole` pixels that the photo covers before any fold."""
+        """Return a mask [H, W] of the pixels of `pinhole`.
+
+        A pixel is True if the photo covers the pixel, and the ray of the pixel is before the fold
+        of the lens model.
+        """
         white = np.full((self.height, self.width), _WHITE, dtype=np.uint8)
         shown: NDArray[np.bool_] = self.undistort(white) == _WHITE
         return shown & self._reach.mask(self.pinhole) if self._reach.folds else shown
@@ -199,16 +207,18 @@ class Calibration:
 
     @cached_property
     def _options(self) -> "pycolmap.UndistortCameraOptions":
-        """The options for pycolmap's undistortion.
+        """The options of pycolmap's undistortion.
 
-        If no ray below 90 degrees hits the border of a photo, pycolmap shrinks the undistorted
-        photo to the smallest allowed size. The options then require at least the photo's size.
+        For a very wide lens, rays below 90 degrees from the axis may all be inside the photo. For
+        such a lens, pycolmap shrinks the undistorted photo to the smallest allowed size. The
+        options for such a lens therefore require at least the size of the original photo.
         """
         guard_pycolmap()
         import pycolmap
 
         options = pycolmap.UndistortCameraOptions()
-        # This call also refuses models without a pinhole equivalent, before `_reach` is computed.
+        # The call of `_undistorted` also raises an error for models that cannot be undistorted,
+        # before `_reach` is computed.
         smallest = self._undistorted(options).width <= options.min_scale * self.width
         if smallest and (self._reach.folds or self._reach.wide):
             options.min_scale = 1.0
@@ -216,7 +226,7 @@ class Calibration:
 
     @cached_property
     def _whole(self) -> Pinhole:
-        """The undistorted calibration before cropping."""
+        """The pinhole camera after undistortion, but before cropping."""
         return self._undistorted(self._options)
 
     def _undistorted(self, options: "pycolmap.UndistortCameraOptions") -> Pinhole:
@@ -235,9 +245,10 @@ class Calibration:
 
     @cached_property
     def _box(self) -> tuple[int, int, int, int]:
-        """Left, top, right and bottom border of `pinhole` in the pixels of `_whole`.
+        """Borders of `pinhole` in the pixels of `_whole`: left, top, right, bottom.
 
-        If the model folds over inside the photo, the pixels outside the valid region are cropped.
+        If the lens model folds over inside the photo, all pixels outside the valid region are
+        cropped.
         """
         whole = self._whole
         if not self._reach.folds:

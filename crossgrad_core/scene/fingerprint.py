@@ -1,6 +1,7 @@
-"""The fingerprint of a scene, and how two fingerprints differ.
+"""Compute the fingerprint of a scene, and list the differences between two fingerprints.
 
-A fingerprint contains the frame, cameras, split, points, and the digests of the scene's files.
+A fingerprint contains the local frame, the cameras, the split, a summary of the points, and digests
+of files.
 """
 
 import os
@@ -21,14 +22,16 @@ from crossgrad_core.scene.photos.photos import FilePhoto
 from crossgrad_core.scene.split import TEST_LIST, TRAIN_LIST
 from crossgrad_core.scene.wording import name_some
 
-#: Version of the layout. It is raised if an older reader could misread a newer fingerprint.
+#: Version of the format of fingerprints. Increase this number if an older version of crossgrad
+#: could misread a newer fingerprint.
 FORMAT: Final = 1
-#: Number of bytes of a file that are read at its start and at its end.
+#: Number of bytes that are read at the start and at the end of a file.
 END = 64 * 2**10
-#: Number of decimals that are stored for pixels and local units. This is far more precise than
-#: needed to distinguish cameras.
+#: Number of stored decimals of values in pixels and in local units. Differences between cameras are
+#: much larger than this rounding.
 DECIMALS = 6
-# Libraries on another machine may round the last digits differently.
+# Values count as equal within this tolerance, because other machines may round the last digits
+# differently.
 _TOLERANCE = 10.0 ** (1 - DECIMALS)
 
 
@@ -41,9 +44,10 @@ class FileMark(_Mark):
 
     Attributes:
         bytes: Size of the file in bytes.
-        sha256: Digest of the first and last 64 KiB of the file; stored by runs of all versions.
-        whole: Digest of the whole file; None if `sha256` already covers the whole file, and in
-            fingerprints of earlier versions.
+        sha256: Digest of the first and the last 64 KiB of the file. Runs of all versions store this
+            digest.
+        whole: Digest of the complete file. The digest is None if `sha256` already covers the
+            complete file, and in fingerprints of earlier versions.
     """
 
     bytes: int
@@ -51,7 +55,7 @@ class FileMark(_Mark):
     whole: str | None = None
 
     def differs(self, other: "FileMark | None") -> bool:
-        """Return True if the other mark belongs to a different file."""
+        """Return True if `other` describes a file with different content."""
         if other is None:
             return True
         ends = (self.bytes, self.sha256) != (other.bytes, other.sha256)
@@ -63,9 +67,9 @@ class ViewMark(_Mark):
 
     Attributes:
         trained: True for a training view, False for a held-out view.
-        camera: Width, height, fx, fy, cx, cy in pixels, then centre, right and forward axis in the
-            local frame.
-        photo: File of the photo; None if the photo comes from no file.
+        camera: Width, height, fx, fy, cx, cy in pixels, then the centre, right axis and forward
+            axis in the local frame.
+        photo: File of the photo; None if the photo was not read from a file.
         mask: File of the mask; None without a mask.
     """
 
@@ -76,30 +80,30 @@ class ViewMark(_Mark):
 
 
 class FrameMark(_Mark):
-    """The local frame: its origin in input units, and local units per input unit."""
+    """The local frame: its origin in input units, and the number of local units per input unit."""
 
     offset: tuple[float, float, float]
     scale: Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class PointsMark(_Mark):
-    """The SfM points: their number, and mean and spread of position (local units) and colour."""
+    """Summary of the SfM points: their number, and mean and deviation of positions and colours."""
 
     count: int
     moments: tuple[float, ...]
 
 
 class Fingerprint(_Mark):
-    """The fingerprint of a scene.
+    """The fingerprint of a scene, for comparison with later versions of the scene.
 
     Attributes:
-        format: Version of the layout.
+        format: Version of the format.
         frame: The local frame.
-        points: The SfM points.
-        lists: Name -> digest of each split list.
-        files: Path relative to the scene's folder -> file, for the files that the reader used,
-            except photos and masks; None in a fingerprint of an earlier version.
-        views: Name -> view.
+        points: Summary of the SfM points.
+        lists: Name of a split list -> digest of its file.
+        files: Path relative to the scene's folder -> file, for all files that the reader used
+            except photos and masks. In fingerprints of earlier versions, `files` is None.
+        views: Name of a view -> its split, camera and files.
     """
 
     format: Literal[1] = FORMAT
@@ -111,7 +115,7 @@ class Fingerprint(_Mark):
 
 
 def fingerprint_of(scene: Scene, root: Path) -> Fingerprint:
-    """Return the fingerprint of a scene; reads all of its files.
+    """Return the fingerprint of a scene. The function reads all files of the scene.
 
     Args:
         scene: The scene.
@@ -153,7 +157,8 @@ def mark_of(path: Path) -> FileMark:
             file.seek(max(END, size - END))
             digest.update(file.read(END))
             file.seek(0)
-            # For a small file, both ends together contain the complete file.
+            # For a small file, the first and the last bytes together already cover the complete
+            # file.
             whole = file_digest(file, "sha256").hexdigest() if size > 2 * END else None
     except OSError as error:
         raise UserError(
@@ -167,7 +172,7 @@ def mark_of(path: Path) -> FileMark:
 
 def _files_of(view: View) -> tuple[FileMark | None, FileMark | None]:
     photo = view.photo
-    # Photos of plugins may come from other sources than files.
+    # A plugin may provide photos that do not come from files.
     if not isinstance(photo, FilePhoto):
         return None, None
     mask = photo.source.mask
@@ -192,24 +197,25 @@ def _points_of(scene: Scene) -> PointsMark:
 
 
 class Weight(IntEnum):
-    """The effect of a difference on a model that was trained on the former scene."""
+    """How much a difference affects a model that was trained on the former scene."""
 
-    #: Only pixels or points differ. All cameras and parameters are unchanged.
+    #: Only pixels or points differ. All cameras are unchanged, and the trained parameters stay
+    #: valid.
     CONTENT = 1
-    #: Other views are held out than before.
+    #: The set of held-out views has changed.
     HELD_OUT = 2
-    #: Other views are trained than before, or cameras moved. The trained parameters would be at
-    #: wrong positions.
+    #: The set of training views has changed, or cameras have moved. The trained parameters would be
+    #: at wrong positions in the new scene.
     PLACE = 3
 
 
 @dataclass(frozen=True)
 class Difference:
-    """One difference between two fingerprints.
+    """A difference between two fingerprints.
 
     Attributes:
-        weight: The effect of the difference on a trained model.
-        text: The description of the difference.
+        weight: How much the difference affects a trained model.
+        text: Description of the difference for the user.
     """
 
     weight: Weight
@@ -217,16 +223,18 @@ class Difference:
 
 
 def differences(was: Fingerprint, now: Fingerprint) -> list[Difference]:
-    """Return the differences between the former and the current scene; empty if they are equal.
+    """Return the differences between the former and the current scene.
 
-    A change of the training views also changes the local frame and all values measured in it. In
-    this case only the change of the views is reported.
+    The list is empty if both scenes are equal.
+
+    If the training views change, the local frame and all values in local units change as well. If
+    the training views have changed, only this change is reported.
     """
     changes = _views(was, now)
     if not any(change.weight is Weight.PLACE for change in changes):
         changes += _frame(was, now) or [*_cameras(was, now), *_points(was, now)]
     changes += _files(was, now)
-    # Report other changed files only if no difference was found so far.
+    # Report changes of other files only if no other difference was found.
     return changes or _others(was, now)
 
 
@@ -297,7 +305,10 @@ def _files(was: Fingerprint, now: Fingerprint) -> list[Difference]:
 
 
 def _others(was: Fingerprint, now: Fingerprint) -> list[Difference]:
-    """Return differences of files except photos and masks; empty if no files were recorded."""
+    """Return differences of files other than photos and masks.
+
+    The list is empty if a fingerprint contains no files.
+    """
     if was.files is None or now.files is None:
         return []
     names = was.files.keys() | now.files.keys()

@@ -1,4 +1,4 @@
-"""The rays that a lens maps to pixels one to one, and the losses of undistortion to a pinhole."""
+"""The rays that a lens model maps to unique pixels, and the image loss by undistortion."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -12,34 +12,38 @@ from crossgrad_core.contract.scene import Pinhole
 if TYPE_CHECKING:
     import pycolmap
 
-#: Number of directions around the axis, and number of steps along each direction, for a coarse and
-#: for a fine scan.
+#: Number of directions around the optical axis, and number of steps along each direction: first for
+#: a coarse scan, then for a fine scan.
 _FIRST, _CLOSER = (72, 128), (180, 360)
-#: The largest scanned angle from the axis: a pinhole camera ends at 90 degrees.
+#: Largest scanned angle from the optical axis. A pinhole camera cannot show 90 degrees or more.
 _WIDEST: Final = np.deg2rad(89.5)
-#: The last pixel before the fold is spread over many undistorted pixels, so it is ignored.
+#: The last pixel before the fold is ignored, because undistortion would spread this pixel over many
+#: pixels.
 _RIM: Final = 1.0
-#: Number of cells along each side of a frame for the sum of areas, and number of rows that are
-#: masked at a time.
+#: Number of cells along each image side for a sum of areas, and number of rows for which a mask is
+#: computed at a time.
 _CELLS, _ROWS = 64, 256
-#: Degree of the polynomial that extrapolates the radius beyond 90 degrees.
+#: Degree of the polynomial that extrapolates the radius to angles beyond 90 degrees.
 _DEGREE: Final = 13
 
 
 @dataclass(frozen=True, eq=False)
 class LensReach:
-    """The rays that a lens maps to pixels one to one.
+    """The rays that a lens model maps to unique pixels.
 
-    A distortion model folds over if the distorted radius stops growing with the undistorted radius.
-    Rays beyond the fold hit pixels that inner rays also hit, so they carry no image content.
+    A lens model folds over at the angle from which the distorted radius no longer grows with the
+    undistorted radius. Rays beyond the fold hit pixels that other rays hit as well. Pixels of rays
+    beyond the fold therefore show no image content of their own.
 
     Attributes:
-        limits: [A] tangent of the largest angle from the axis before the fold. The directions are
-            spread evenly over the circle; they start at the right side and turn downwards.
-        folds: True if the fold is inside the photo in some direction.
-        wide: True if the photo covers 90 degrees or more from the axis in some direction.
-        box: Smallest and largest x, then y, of the rays inside the photo, at distance 1.
-        seen: Field of view along the longer side, degrees.
+        limits: [A] for each direction, the tangent of the largest angle from the axis before the
+            fold. The directions are evenly spread over the circle. The first direction points to
+            the right, and the next directions turn downwards.
+        folds: True if the fold is inside the photo in any direction.
+        wide: True if the photo covers 90 degrees or more from the axis in any direction.
+        box: Smallest and largest x, then smallest and largest y, of the rays inside the photo, at
+            distance 1.
+        seen: Field of view along the longer side of the photo, in degrees.
     """
 
     limits: NDArray[np.float64]
@@ -50,7 +54,7 @@ class LensReach:
 
     @classmethod
     def of(cls, camera: "pycolmap.Camera") -> "LensReach":
-        """Compute the reach of a camera."""
+        """Compute the rays that a camera maps to unique pixels."""
         first = cls._looked_at(camera, *_FIRST)
         return cls._looked_at(camera, *_CLOSER) if first.folds or first.wide else first
 
@@ -84,14 +88,20 @@ class LensReach:
         )
 
     def beyond(self, plane: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return a mask [...] of points [..., 2] at distance 1: True for rays beyond the fold."""
+        """Return a mask [...] of points [..., 2] at distance 1.
+
+        A point is True if its ray is beyond the fold.
+        """
         x, y = plane[..., 0], plane[..., 1]
         around = 2.0 * np.pi * np.arange(len(self.limits)) / len(self.limits)
         limits = np.interp(np.arctan2(y, x), around, self.limits, period=2.0 * np.pi)
         return np.asarray(np.hypot(x, y) > limits)
 
     def mask(self, frame: Pinhole) -> NDArray[np.bool_]:
-        """Return a mask [H, W] of the pixels of a pinhole camera that are before the fold."""
+        """Return a mask [H, W] of the pixels of a pinhole camera.
+
+        A pixel is True if its ray is before the fold.
+        """
         mask = np.empty((frame.height, frame.width), dtype=np.bool_)
         x = np.arange(frame.width) + 0.5
         for start in range(0, frame.height, _ROWS):
@@ -102,13 +112,13 @@ class LensReach:
 
 @dataclass(frozen=True)
 class LensCost:
-    """The losses of undistortion to a pinhole camera.
+    """The image content that is lost by undistortion to a pinhole camera.
 
     Attributes:
-        seen: Field of view of the photo along its longer side, degrees.
-        kept: Part of this field of view in the undistorted photo, degrees.
+        seen: Field of view along the longer side of the photo, in degrees.
+        kept: Part of this field of view that the undistorted photo shows, in degrees.
         lost: Share of the photo's pixels that are missing in the undistorted photo.
-        beyond: Share of the undistorted photo's pixels that are beyond the fold of the model.
+        beyond: Share of the undistorted photo's pixels whose rays are beyond the fold.
     """
 
     seen: float
@@ -118,7 +128,7 @@ class LensCost:
 
 
 def cost_of(camera: "pycolmap.Camera", reach: LensReach, frame: Pinhole) -> LensCost:
-    """Return the losses of a camera whose photos are undistorted to `frame`."""
+    """Return the image content that is lost by undistorting a camera's photos to `frame`."""
     u = np.linspace(0.0, frame.width, _CELLS + 1)
     v = np.linspace(0.0, frame.height, _CELLS + 1)
     plane = _plane(frame, *np.meshgrid(u, v))
@@ -144,27 +154,33 @@ def cost_of(camera: "pycolmap.Camera", reach: LensReach, frame: Pinhole) -> Lens
 
 
 def source_pixels(camera: "pycolmap.Camera", plane: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Project rays through points [N, 2] at distance 1 to pixels [N, 2]; NaN without a pixel."""
+    """Project rays through points [N, 2] at distance 1 to pixels [N, 2].
+
+    A ray without a pixel gives NaN.
+    """
     rays = np.column_stack([plane, np.ones(len(plane))])
     return np.asarray(camera.img_from_cam(rays), dtype=np.float64).reshape(-1, 2)
 
 
 def _plane(frame: Pinhole, u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the points [..., 2] at distance 1 that pixels of a pinhole camera show."""
+    """Return the points [..., 2] at distance 1 in the pixels of a pinhole camera."""
     return np.stack([(u - frame.cx) / frame.fx, (v - frame.cy) / frame.fy], axis=-1)
 
 
 def _is_inside(pixels: NDArray[np.float64], camera: "pycolmap.Camera") -> NDArray[np.bool_]:
-    """Return a mask [...] of the pixels [..., 2] inside the photo; False for NaN."""
+    """Return a mask [...] of pixels [..., 2].
+
+    A pixel is True if its position is inside the photo; NaN gives False.
+    """
     within = (pixels >= 0.0) & (pixels <= [camera.width, camera.height])
     return np.asarray(within.all(axis=-1))
 
 
 def _last_before_fold(pixels: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the last step [A] of each direction [A, N, 2] before the model folds over.
+    """Return the last step [A] before the model folds over, for directions `pixels` [A, N, 2].
 
-    Before the fold, the distance from the centre grows with every step. The Jacobian's determinant
-    is positive, so that neighbouring directions keep their order.
+    Before the fold, the distance from the image centre grows with every step. In addition, the
+    determinant of the Jacobian is positive, so that neighbouring directions keep their order.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         radius = np.linalg.norm(pixels - pixels[:, :1], axis=2)
@@ -181,10 +197,11 @@ def _seen(
     used: NDArray[np.bool_],
     degrees: NDArray[np.float64],
 ) -> float:
-    """Compute the field of view of a photo along its longer side, degrees.
+    """Return the field of view along the longer side of a photo, in degrees.
 
-    COLMAP's models are defined only below 90 degrees from the axis. For larger angles a polynomial
-    in the angle is used, which fits the fisheye models up to rounding.
+    COLMAP's lens models are defined only for angles below 90 degrees from the axis. For larger
+    angles, the function extrapolates with a polynomial in the angle. The polynomial fits the
+    fisheye models up to rounding.
     """
     axis = 0 if camera.width >= camera.height else 1
     size = (camera.width, camera.height)[axis]

@@ -1,9 +1,9 @@
-"""Point clouds from PLY, LAS or LAZ files, thinned to the density of SfM points.
+"""Read point clouds from PLY, LAS or LAZ files, and reduce them to the density of SfM points.
 
-LAS and LAZ files, the formats of laser scanners, are read if the package laspy is installed.
+LAS and LAZ files, which laser scanners write, can be read if the package laspy is installed.
 
-Source of the format: ASPRS, LAS specification 1.4. A position is an integer times the scale plus
-the offset from the header; laspy computes it in float64.
+Source of the format: ASPRS, LAS specification 1.4. A position is an integer times a scale plus an
+offset, both from the header. laspy computes positions in float64.
 """
 
 from collections.abc import Iterator, Mapping
@@ -26,48 +26,48 @@ if TYPE_CHECKING:
 
 #: Suffixes of LAS and LAZ files.
 SUFFIXES: Final = (".las", ".laz")
-#: Suffixes of all point clouds.
+#: Suffixes of all point cloud files.
 CLOUDS: Final = (".ply", *SUFFIXES)
 _GREY: Final = 127
-#: If this percentile of the colours is at least `_LONG`, the colours have 16 bits.
+#: Colours have 16 bits if the `_MOST` percentile of their values is at least `_LONG`.
 _MOST: Final = 99.0
 _LONG: Final = 512.0
 _COLORS: Final = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
-#: Properties of Gaussians that points do not have.
+#: PLY properties that only Gaussians have.
 _GAUSSIAN: Final = frozenset({"f_dc_0", "opacity", "scale_0", "rot_0"})
 _RGB: Final = ("red", "green", "blue")
 _AT_ONCE: Final = 1_000_000
-#: Maximum number of points that are read from a file. From a larger file, only every n-th point is
-#: read.
+#: Maximum number of points that are read from a file. If the file contains more points, only every
+#: n-th point is read.
 _MOST_IN_LAS: Final = 20_000_000
-#: Number of points that are kept by default: FEWEST, or PER_PHOTO for each photo if that is more.
-#: Structure from motion finds a few hundred points per photo.
+#: Default number of points: at least `FEWEST`, and `PER_PHOTO` for each photo. Structure from
+#: motion finds a few hundred points for each photo.
 FEWEST: Final = 100_000
 PER_PHOTO: Final = 1_000
-#: Maximum number of cube sizes that are tried. The search ends early when it keeps at least this
-#: share of the wanted number of points.
+#: Maximum number of cube sizes that are tried. The search ends early if the result contains at
+#: least this share of the wanted number of points.
 _TRIES, _ENOUGH = 12, 0.8
-#: Number of sampled points from which the size of a cloud is estimated.
+#: Number of points in the sample from which the size of a cloud is estimated.
 _SAMPLED: Final = 100_000
-#: Points are on surfaces, so the number of occupied cubes is inversely proportional to the square
-#: of the side.
+#: Most points are on surfaces. The number of occupied cubes is therefore proportional to 1 /
+#: side^2.
 _SURFACE: Final = 2.0
-#: Odd factors that hash the integer coordinates of a cube.
+#: Odd factors of a hash function for the integer coordinates of cubes.
 _FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)
 _FARTHEST: Final = 2.0**62
-#: Side of the cubes in input units, if all points have the same position.
+#: Side of the cubes in input units if all points are at one position.
 _SMALLEST: Final = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """Points of the input, with their colours.
+    """The points of a file with their colours.
 
     Attributes:
         positions: [P, 3] float64.
         colors: [P, 3] uint8.
-        source: File of the points; empty if there are no points.
-        gaussians: True if the file contains Gaussians, whose colours are not read.
+        source: Name of the file; empty without points.
+        gaussians: True if the file contains Gaussians. Colours of Gaussians are not read.
     """
 
     positions: NDArray[np.float64]
@@ -77,7 +77,7 @@ class PointCloud:
 
     @property
     def note(self) -> str:
-        """Part of a note: the number of points and their file."""
+        """Part of a note to the user: the number of points and their file."""
         if not self.source:
             return "no points"
         return f"{len(self.positions)} points from {self.source}"
@@ -87,10 +87,12 @@ NO_POINTS: Final = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8)
 
 
 def read_cloud(path: Path, source: str) -> PointCloud:
-    """Read positions and colours of a PLY, LAS or LAZ file; grey if the file has no colours.
+    """Read the positions and colours of a PLY, LAS or LAZ file.
+
+    Points are grey if the file contains no colours.
 
     Raises:
-        UserError: The file is not a point cloud, or laspy is missing for LAS and LAZ.
+        UserError: The file is not a point cloud, or laspy is missing for a LAS or LAZ file.
     """
     is_las = path.suffix.lower() in SUFFIXES
     columns = read_las(path) if is_las else read_vertices(path).columns
@@ -103,7 +105,7 @@ def read_cloud(path: Path, source: str) -> PointCloud:
             found=f"no {', '.join(missing)}",
             todo="export the points again",
         )
-    # A signalling NaN causes this warning. The points are left out with a note
+    # Converting a signalling NaN causes a warning. Points with NaN are left out later, with a note.
     with np.errstate(invalid="ignore"):
         positions = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64)
     return PointCloud(
@@ -112,7 +114,10 @@ def read_cloud(path: Path, source: str) -> PointCloud:
 
 
 def _colors(columns: Mapping[str, NDArray[np.generic]], count: int) -> NDArray[np.uint8]:
-    """Convert colours to uint8 [P, 3] from integers up to 255 or 65,535, or fractions up to 1."""
+    """Convert colours to uint8 [P, 3].
+
+    Integers up to 255 or 65,535, and fractions up to 1, are accepted.
+    """
     names = next((names for names in _COLORS if all(name in columns for name in names)), None)
     if names is None:
         return np.full((count, 3), _GREY, dtype=np.uint8)
@@ -121,8 +126,9 @@ def _colors(columns: Mapping[str, NDArray[np.generic]], count: int) -> NDArray[n
         return stored
     with np.errstate(invalid="ignore"):
         values = np.nan_to_num(stored.astype(np.float64))
-    # Text files do not store types. If values are above 1, they are integers. If values are far
-    # above 255, they are 16-bit integers, as scanners write them.
+    # A text file does not store the type of its numbers. If any value is above 1, the values are
+    # integers. If many values are far above 255, the values are 16-bit integers, which scanners
+    # write.
     sizes = np.abs(values[np.isfinite(stored)])
     long = len(sizes) > 0 and np.percentile(sizes, _MOST) >= _LONG
     top = 1.0 if sizes.max(initial=0.0) <= 1.0 else 65_535.0 if long else 255.0
@@ -130,7 +136,9 @@ def _colors(columns: Mapping[str, NDArray[np.generic]], count: int) -> NDArray[n
 
 
 def read_las(path: Path) -> dict[str, NDArray[np.generic]]:
-    """Read the columns x, y and z of the points, and red, green and blue if the file has colours.
+    """Read the columns x, y and z of the points.
+
+    If the file contains colours, also read red, green and blue.
 
     Raises:
         UserError: laspy is missing, or the file cannot be read.
@@ -142,7 +150,7 @@ def read_las(path: Path) -> dict[str, NDArray[np.generic]]:
         with open_file(path) as file, laspy.open(file) as reader:
             rows = list(_rows(reader))
             expected, names = reader.header.point_count, _names(reader)
-    # A damaged file can raise any error of numpy, struct or the decompressor.
+    # For a damaged file, numpy, struct or the decompressor can raise any error.
     except Exception as error:
         raise UserError(
             "the point cloud cannot be read",
@@ -166,7 +174,7 @@ def read_las(path: Path) -> dict[str, NDArray[np.generic]]:
 
 
 def _rows(reader: "laspy.LasReader") -> Iterator[tuple[int, NDArray[np.float64]]]:
-    """Yield for each part of the file its number of points and the kept rows [n, 3 or 6]."""
+    """Yield each part of the file: its number of points, and the kept points [n, 3 or 6]."""
     names, start = _names(reader), 0
     stride = -(-reader.header.point_count // _MOST_IN_LAS) or 1
     for chunk in reader.chunk_iterator(_AT_ONCE):
@@ -194,9 +202,12 @@ def _require_laspy(path: Path) -> None:
 
 
 def thinned(points: CheckedPoints, most: int) -> tuple[CheckedPoints, list[str]]:
-    """Return at most `most` of the points, one from each cube of a grid, and a note.
+    """Return at most `most` of the points, and a note.
 
-    The first point of each cube in file order is kept, so that equal input gives equal points.
+    Of all points in a cube of a grid, one point is kept.
+
+    The kept point is the first point of the cube in the order of the file. Equal files therefore
+    give equal points.
     """
     count = len(points.xyz)
     if count <= most:
@@ -210,9 +221,12 @@ def thinned(points: CheckedPoints, most: int) -> tuple[CheckedPoints, list[str]]
 
 
 def _one_per_cube(xyz: NDArray[np.float64], most: int) -> tuple[NDArray[np.int64], float]:
-    """Return the rows of the first point in each cube, at most `most`, and the side of the cubes.
+    """Return the row of the first point in each cube, and the side of the cubes.
 
-    If no cube size gives few enough points, evenly spaced rows are returned, and the side is 0.
+    There are at most `most` rows.
+
+    If every tried cube size leaves too many points, evenly spaced rows are returned with a side of
+    0.
     """
     sample = xyz[:: -(-len(xyz) // _SAMPLED)]
     low, high = np.percentile(sample, [1.0, 99.0], axis=0)
@@ -236,7 +250,7 @@ def _one_per_cube(xyz: NDArray[np.float64], most: int) -> tuple[NDArray[np.int64
 
 
 def _first_in_cubes(places: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return ascending rows of the first of the points [P, 3] in each unit cube."""
+    """Return the row of the first point in each unit cube, in ascending order."""
     cubes = np.floor(places.clip(-_FARTHEST, _FARTHEST)).astype(np.int64).astype(np.uint64)
     keys = (cubes * _FACTORS).sum(axis=1, dtype=np.uint64)
     return np.sort(np.unique(keys, return_index=True)[1])

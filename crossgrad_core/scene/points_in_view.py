@@ -1,4 +1,4 @@
-"""A check that refuses points in another coordinate frame than the cameras."""
+"""Check that points and cameras are in a common coordinate frame."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -14,11 +14,12 @@ from crossgrad_core.scene.frame import camera_centers
 from crossgrad_core.scene.point_cloud import PointCloud
 from crossgrad_core.scene.raw import RawView
 
-#: Number of points and photos that are tested, and the minimum share of points that must be visible
-#: in a photo.
+#: `_TRIED`: approximate number of tested points, and of tested photos. `_FEWEST`: minimum share
+#: of the tested points that must be inside at least one photo.
 _TRIED: Final = 1000
 _FEWEST: Final = 0.01
-#: If a change of the poses brings this share of points into photos, it is the likely cause.
+#: If photos show at least this share of the points after a change of the poses, the poses are
+#: probably wrong.
 _REPAIRED: Final = 0.5
 
 _Change: TypeAlias = Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -32,9 +33,9 @@ def _inverse(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     return inverse
 
 
-#: Converts the axes of a camera from OpenGL to OpenCV, and back.
+#: Converts the camera axes from OpenGL to OpenCV, and from OpenCV to OpenGL.
 _FLIP: Final = np.diag([1.0, -1.0, -1.0, 1.0])
-#: Mistakes in poses that put all points behind the cameras or outside the photos.
+#: Mistakes in poses after which no photo shows the points.
 _MISTAKES: Final[tuple[tuple[str, _Change], ...]] = (
     (
         "the camera axes follow another convention (OpenGL: y up, z backward)",
@@ -58,16 +59,18 @@ _MISTAKES: Final[tuple[tuple[str, _Change], ...]] = (
 def check_seen(
     points: PointCloud, views: Sequence[RawView], where: object, todo: str = "remove the file"
 ) -> None:
-    """Refuse points that almost no photo shows, because they are in another frame than the cameras.
+    """Raise an error if almost no photo shows the points.
+
+    If almost no photo shows the points, points and cameras have different frames.
 
     Args:
-        points: Points of the input.
-        views: Views of the input.
-        where: Location of the poses, for the error message.
-        todo: Another remedy for this format.
+        points: The points of the input.
+        views: The views of the input.
+        where: File of the poses, for the error message.
+        todo: Alternative remedy for the format of the input.
 
     Raises:
-        UserError: Less than one point in a hundred is inside a photo.
+        UserError: Less than one percent of the points are inside a photo.
     """
     finite = points.positions[np.isfinite(points.positions).all(axis=1)]
     tried = finite[:: max(1, len(finite) // _TRIED)]
@@ -93,7 +96,10 @@ def check_seen(
 
 
 def _likely_cause(points: NDArray[np.float64], views: Sequence[RawView]) -> str | None:
-    """Return the mistake in the poses whose repair brings most points into photos, or None."""
+    """Return the mistake in the poses whose correction makes photos show the most points.
+
+    Return None without a likely mistake.
+    """
     best, cause = _REPAIRED, None
     for text, change in _MISTAKES:
         shown = _shown_by(points, views, change)
@@ -106,7 +112,7 @@ def _likely_cause(points: NDArray[np.float64], views: Sequence[RawView]) -> str 
 def _shown_by(
     points: NDArray[np.float64], views: Sequence[RawView], change: _Change
 ) -> NDArray[np.bool_]:
-    """Return a mask [V, N] of the points inside each photo after a change of the poses."""
+    """Return a mask [V, N] of the points inside each photo, after `change` modified the poses."""
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         return np.stack(
             [
@@ -117,7 +123,7 @@ def _shown_by(
 
 
 def _shown(points: NDArray[np.float64], view: RawView) -> NDArray[np.bool_]:
-    """Return a mask [N] of the points inside a photo, without the distortion of its lens."""
+    """Return a mask [N] of the points inside a photo. Lens distortion is ignored."""
     lens, pose = view.calibration.without_distortion, torch.from_numpy(view.world_to_camera)
     pixels, depth = Camera(**vars(lens), world_to_camera=pose).project(points)
     inside = (pixels >= 0.0) & (pixels <= [lens.width, lens.height])

@@ -1,4 +1,4 @@
-"""Import of pycolmap without its side effects on the process."""
+"""Import pycolmap without its side effects on the process."""
 
 import signal
 import sys
@@ -6,12 +6,15 @@ import threading
 
 
 def guard_pycolmap() -> None:
-    """Import pycolmap without side effects on the process; call this before importing it.
+    """Import pycolmap without side effects on the process.
 
-    pycolmap 4.2.1 exports the symbols of its own zlib. If pycolmap loads before the system's zlib,
-    Pillow later mixes the two libraries, and writing a PNG aborts. Therefore zlib is imported
-    first. pycolmap also installs a SIGTERM handler that prints a stack trace and ends the process
-    without calling Python's handler. Therefore the former handler is restored.
+    Call this function before any import of pycolmap.
+
+    pycolmap 4.2.1 contains its own zlib and exports the symbols of this library. If pycolmap is
+    loaded before the system's zlib, Pillow later mixes both libraries, and writing a PNG file
+    aborts the process. To avoid this abort, zlib is imported first. pycolmap also installs a
+    SIGTERM handler, which ends the process without calling Python's handler. The function therefore
+    restores the previous handler.
     """
     if "pycolmap" in sys.modules:
         return

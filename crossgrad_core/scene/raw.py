@@ -1,4 +1,4 @@
-"""The raw scene: the output of a reader before split and local frame, and checks of this output."""
+"""The raw scene: the result of a reader before split and local frame are chosen, with checks."""
 
 import os
 import re
@@ -15,31 +15,35 @@ from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.frame import Frame, camera_centers
 from crossgrad_core.scene.wording import count, name_some
 
-#: Coordinates larger than this, in input units, are invalid, because their squares must stay within
+#: Coordinates above this number of input units are invalid, because their squares could overflow
 #: float64.
 FARTHEST = 1e30
-#: Largest coordinate in local units. Its square must stay within float32.
+#: Largest allowed coordinate in local units. The square of this coordinate does not overflow
+#: float32.
 FARTHEST_LOCAL = 1e15
-#: Largest number of bytes of a file or folder name, and of a whole path, that usual file systems
-#: allow.
+#: Largest number of bytes that usual file systems allow for a file or folder name, and for a
+#: complete path.
 LONGEST_PART, LONGEST_NAME = 255, 1024
-_NO_SIGNS = {"Cc", "Cs"}  # Control characters, and bytes that are not UTF-8
-# Tolerance of the test for rigid rotations. Rotations written with six digits pass, and a pose that
-# contains a scale fails.
+_NO_SIGNS = {"Cc", "Cs"}  # Control characters, and bytes that are not valid UTF-8.
+# Tolerance for checking that a pose is rigid. Rotations that are written with six digits pass the
+# check; poses that contain a scale fail.
 _RIGID = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class RawView:
-    """A posed photo as the input describes it.
+    """An image with a pose, as the input describes it.
 
     Attributes:
-        name: Path below the image folder with forward slashes; unique.
-        calibration: Camera model, before undistortion and resizing.
-        world_to_camera: [4, 4] float64, rigid, input frame to camera frame (OpenCV axes).
-        seen: [S] int64 rows of the scene's points that the view observed; may be empty.
-        mask: The mask, if the input names one; an option for the mask folder has priority.
-        place: Path whose folders give the regime; None uses the folders of `name`.
+        name: Path below the image folder with forward slashes. Each name occurs only once.
+        calibration: Calibration of the camera before undistortion and resizing.
+        world_to_camera: [4, 4] float64 rigid transform from the input frame to the camera frame
+            (OpenCV axes).
+        seen: [S] int64 rows of the points that the view observes; may be empty.
+        mask: Path of the mask, if the input names a mask. The option for the mask folder has
+            priority.
+        place: Path whose folders determine the regime of the view. If `place` is None, the path
+            `name` is used.
     """
 
     name: str
@@ -52,21 +56,24 @@ class RawView:
 
 @dataclass(frozen=True, eq=False)
 class RawScene:
-    """A scene as the input describes it; `crossgrad_core.scene.build` turns it into a `Scene`.
+    """A scene as the input describes it.
+
+    `crossgrad_core.scene.build` converts a `RawScene` to a `Scene`.
 
     Attributes:
-        root: The scene's folder. The folder may contain split lists and the default mask folder,
-            and its name is the scene's name.
-        images: The folder of the photos; the siblings `<images>_2`, `_4` and `_8` may contain
-            smaller copies.
-        views: The posed photos, in any order.
-        points: [P, 3] float64 SfM points, input frame; may be empty.
-        point_colors: [P, 3] uint8 RGB.
-        notes: Changes that the reader made to the input.
-        split: Names of the training and of the test views, if the input prescribes a split.
-        background: RGB in [0, 1] behind photos with an alpha channel; None if pixels with alpha
-            below a half do not count.
-        files: Files that the reader used, except photos and masks.
+        root: Folder of the scene. The folder may contain split lists and the default mask folder.
+            The name of the folder becomes the scene's name.
+        images: Folder of the photos. The neighbouring folders `<images>_2`, `_4` and `_8` may
+            contain smaller copies.
+        views: The images with poses, in any order.
+        points: [P, 3] float64 SfM points in the input frame; may be empty.
+        point_colors: [P, 3] uint8 RGB colours of the points.
+        notes: Notes about changes that the reader made to the input.
+        split: Names of the training and of the held-out views; None if the input prescribes no
+            split.
+        background: RGB in [0, 1] behind transparent pixels. If `background` is None, all pixels
+            with alpha below one half are masked.
+        files: Paths of the files that the reader used, except photos and masks.
     """
 
     root: Path
@@ -82,12 +89,13 @@ class RawScene:
 
 @dataclass(frozen=True, eq=False)
 class CheckedPoints:
-    """The finite points of a scene.
+    """The points of a scene that are finite.
 
     Attributes:
-        xyz: [P, 3] float64, input frame.
-        colors: [P, 3] uint8.
-        new_row: [Q] int64, row among the finite points for each input point; -1 if it was removed.
+        xyz: [P, 3] float64 positions in the input frame.
+        colors: [P, 3] uint8 RGB colours.
+        new_row: [Q] int64: for each input point, its row among the finite points; -1 if the point
+            was removed.
     """
 
     xyz: NDArray[np.float64]
@@ -95,18 +103,18 @@ class CheckedPoints:
     new_row: NDArray[np.int64]
 
     def rows(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Convert rows of the input's points to sorted, distinct rows [S'] of the finite points."""
+        """Convert rows of input points to sorted, distinct rows [S'] of finite points."""
         kept = np.unique(self.new_row[rows])
         return kept[kept >= 0]
 
     def selected(self, chosen: NDArray[np.bool_]) -> "CheckedPoints":
-        """Return the points that are marked in `chosen` [P]."""
+        """Return the points for which `chosen` [P] is True."""
         numbers = np.append(np.where(chosen, np.cumsum(chosen) - 1, -1), -1)
         return CheckedPoints(self.xyz[chosen], self.colors[chosen], numbers[self.new_row])
 
 
 def is_possible_name(text: str) -> bool:
-    """Return True if a path is a valid file name on every usual file system."""
+    """Return True if a path is a valid file name on all usual file systems."""
     if any(unicodedata.category(sign) in _NO_SIGNS for sign in text):
         return False
     longest = max(len(os.fsencode(part)) for part in re.split(r"[/\\]", text))
@@ -114,10 +122,10 @@ def is_possible_name(text: str) -> bool:
 
 
 def check_views(raw: RawScene) -> None:
-    """Refuse scenes without views, and views with ambiguous names or invalid poses.
+    """Raise an error if the scene contains no views, ambiguous names, or invalid poses.
 
     Raises:
-        UserError: The scene or a view is refused; the message names the views.
+        UserError: The scene or a view is not valid. The message names the views.
     """
     if not raw.views:
         raise UserError(
@@ -141,8 +149,9 @@ def check_views(raw: RawScene) -> None:
 
 
 def check_points(raw: RawScene) -> tuple[CheckedPoints, list[str]]:
-    """Leave out points that are not finite, and note their number."""
-    finite = np.asarray((np.abs(raw.points) <= FARTHEST).all(1))  # This is also False for NaN.
+    """Remove points that are not finite, and return a note with their number."""
+    # The comparison is also False for NaN.
+    finite = np.asarray((np.abs(raw.points) <= FARTHEST).all(1))
     broken = int((~finite).sum())
     notes = [f"points: {count(broken, 'point')} left out (not finite)"] if broken else []
     new_row = np.where(finite, np.cumsum(finite) - 1, -1)
@@ -152,10 +161,10 @@ def check_points(raw: RawScene) -> tuple[CheckedPoints, list[str]]:
 def check_distances(
     raw: RawScene, points: CheckedPoints, frame: Frame
 ) -> tuple[CheckedPoints, list[str]]:
-    """Leave out points too far from the training cameras for single precision, and note it.
+    """Remove points too far from the training cameras for single precision, and return a note.
 
     Raises:
-        UserError: A camera is too far away.
+        UserError: A camera is too far from the training cameras.
     """
     poses = np.stack([view.world_to_camera for view in raw.views])
     centers = np.abs(frame.similarity.to_local(camera_centers(poses))).max(1)
@@ -205,7 +214,7 @@ def _check_view(raw: RawScene, view: RawView) -> None:
     where = f"{raw.root}: image {view.name}"
     view.calibration.check(where)
     pose = view.world_to_camera
-    if not (np.abs(pose) <= FARTHEST).all():  # This is also False for NaN.
+    if not (np.abs(pose) <= FARTHEST).all():  # The comparison is also False for NaN.
         raise UserError(
             "a pose contains numbers that are not finite",
             where=where,

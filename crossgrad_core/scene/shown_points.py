@@ -1,4 +1,4 @@
-"""The number of training photos that show a point of a scene."""
+"""Count the training photos that show a typical point of a scene."""
 
 from typing import Final
 
@@ -6,12 +6,15 @@ import numpy as np
 
 from crossgrad_core.contract.scene import Scene, is_in_image
 
-#: Number of points that are sampled from the whole cloud.
+#: Number of points in the sample.
 _POINTS: Final = 1000
 
 
 def photos_per_point(scene: Scene) -> float:
-    """Return the median number of training photos that contain an SfM point; 0 without any."""
+    """Return the median number of training photos that show an SfM point.
+
+    Return 0 without points.
+    """
     points = scene.points[:: -(-len(scene.points) // _POINTS) or 1]
     counts = np.zeros(len(points), np.int64)
     for view in scene.train_views:

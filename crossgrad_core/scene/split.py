@@ -1,4 +1,4 @@
-"""The split of the views into training and held-out views."""
+"""Split the views into training views and held-out views."""
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -15,25 +15,25 @@ from crossgrad_core.system.input_files import read_file
 TRAIN_LIST = "train_list.txt"
 TEST_LIST = "test_list.txt"
 
-#: Function that maps the names of training views to the regime of every view. Without folders, the
-#: median of the training views is the threshold.
+#: Function that maps the names of training views to the regimes of all views. If photos are not in
+#: several folders, the regimes depend on a median over the training views.
 Label: TypeAlias = Callable[[Sequence[str]], Mapping[str, str]]
 
-_LINES: Final = {b"\n": 150}  # number of bytes of a name in memory
+_LINES: Final = {b"\n": 150}  # Estimated memory in bytes for each name.
 
-#: A mean over fewer held-out views than this does not describe a regime.
+#: A mean over fewer held-out views does not describe a regime.
 _FEWEST: Final = 2
 
 
 @dataclass(frozen=True)
 class Split:
-    """Names of the training and of the held-out views, both sorted, and how they were chosen.
+    """The names of the training views and of the held-out views, and the reason for this choice.
 
     Attributes:
-        train: Training views.
-        test: Held-out views.
-        notes: Notes on how the views were chosen.
-        regimes: Regime of every view, if the views were chosen by regime.
+        train: Names of the training views, sorted.
+        test: Names of the held-out views, sorted.
+        notes: Notes to the user about the choice of the views.
+        regimes: Regime of each view, by name; None if the views were not chosen by regime.
     """
 
     train: tuple[str, ...]
@@ -49,21 +49,22 @@ def split_views(
     given: tuple[frozenset[str], frozenset[str]] | None = None,
     label: Label = lambda _: {},
 ) -> Split:
-    """Split views by the option `split`; there is always at least one training view.
+    """Split views as the option `split` requires. At least one view is a training view.
 
-    `auto` uses lists or the given split first. If there are none, `auto` holds out each n-th photo
-    of each folder. If fewer than two photos of a regime would be held out, and a split by regime
-    would hold out two or more, `auto` holds out each n-th photo of each regime instead.
+    `auto` first uses list files or the split that the input prescribes. A split by folder may hold
+    out fewer than two photos of a regime. If a split by regime would hold out two or more photos of
+    this regime, `auto` uses the split by regime instead.
 
     Args:
-        names: Names of all usable views.
-        options: The options `split` and `test_every`.
-        root: Folder with `train_list.txt` and `test_list.txt`, if any.
-        given: Training and test names that the input prescribes; lists have priority.
-        label: Returns the regimes; by default there are none.
+        names: Names of all views that can be used.
+        options: Scene options; `split` and `test_every` are used.
+        root: Folder of the scene, which may contain `train_list.txt` and `test_list.txt`.
+        given: Names of training and held-out views that the input prescribes. List files have
+            priority.
+        label: Function that returns the regimes. By default, views have no regimes.
 
     Raises:
-        UserError: The lists contradict each other, match no view or leave no training view.
+        UserError: The lists contradict each other, match no view, or leave no training view.
     """
     if options.split == "none":
         return Split(
@@ -78,7 +79,10 @@ def split_views(
 
 
 def _by_regime(every: Split, names: Sequence[str], options: SceneOptions, label: Label) -> Split:
-    """Return the stratified split if the option or a regime with too few test views needs it."""
+    """Return the split by regime if the option requires this split.
+
+    Also return the split by regime if the split `every` has too few held-out views of a regime.
+    """
     regimes = label(names)
     stratified = _split_stratified(names, options.test_every, regimes)
     if options.split == "stratified":
@@ -93,14 +97,17 @@ def _by_regime(every: Split, names: Sequence[str], options: SceneOptions, label:
 
 
 def _split_every(names: Sequence[str], every: int) -> Split:
-    """Hold out every n-th view of each folder, in the order of names."""
+    """Hold out every n-th view of each folder, in alphabetical order."""
     folders = {name: str(PurePosixPath(name).parent) for name in names}
     how = " in each folder" if len(set(folders.values())) > 1 else ""
     return _split_each(folders, every, how)
 
 
 def _split_stratified(names: Sequence[str], every: int, regimes: Mapping[str, str]) -> Split:
-    """Hold out every n-th view of each regime, in the order of names; `regimes` has all views."""
+    """Hold out every n-th view of each regime, in alphabetical order.
+
+    `regimes` contains the regimes of all views.
+    """
     return replace(
         _split_each({name: regimes.get(name, "") for name in names}, every, " in each regime"),
         regimes=regimes,
@@ -108,7 +115,10 @@ def _split_stratified(names: Sequence[str], every: int, regimes: Mapping[str, st
 
 
 def _split_each(groups: Mapping[str, str], every: int, how: str) -> Split:
-    """Hold out every n-th view of each group by name; groups of one view are merged."""
+    """Hold out every n-th view of each group, in alphabetical order.
+
+    Groups with only one view are merged into one group.
+    """
     members = defaultdict(list)
     for name in sorted(groups):
         members[groups[name]].append(name)
@@ -133,7 +143,8 @@ def _split_by_lists(
     root: Path,
     how: str,
 ) -> Split:
-    # A split that the input prescribes does not come from list files.
+    # If the input prescribes the split, no list files exist. If no list files exist, the message
+    # names the scene's folder.
     places = [root / file if how == "by lists" else root for file in (TRAIN_LIST, TEST_LIST)]
     both = sorted(listed[0] & listed[1])
     if both:
@@ -179,12 +190,15 @@ def _matches_nothing(
 
 
 def has_lists(root: Path) -> bool:
-    """Return True if a scene's folder contains a list of training or of held-out views."""
+    """Return True if the scene's folder contains a list of training views or of held-out views."""
     return any((root / name).is_file() for name in (TRAIN_LIST, TEST_LIST))
 
 
 def _read_lists(root: Path, names: Sequence[str]) -> tuple[frozenset[str], frozenset[str]] | None:
-    """Read the existing lists; if there is only one, all other views form the other list."""
+    """Read the list files.
+
+    If only one list exists, the other list consists of all remaining views.
+    """
     train, test = (_read_list(root / file, names) for file in (TRAIN_LIST, TEST_LIST))
     if train is None and test is None:
         return None
@@ -195,9 +209,11 @@ def _read_lists(root: Path, names: Sequence[str]) -> tuple[frozenset[str], froze
 
 
 def _read_list(path: Path, views: Sequence[str]) -> frozenset[str] | None:
-    """Read the names in a list; a name that matches a view becomes the name of the view.
+    """Read the names in a list file.
 
-    Return None if the list does not exist.
+    A name that matches a view is replaced by the name of the view.
+
+    Return None if the list file does not exist.
     """
     if not path.is_file():
         return None

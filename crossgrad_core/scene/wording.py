@@ -1,4 +1,4 @@
-"""Wording of many names and of sizes in notes and errors."""
+"""Format lists of names, and sizes of photos, for notes and error messages."""
 
 from collections.abc import Sequence
 
@@ -10,7 +10,7 @@ _SHOWN = 3
 
 
 def name_some(names: Sequence[str]) -> str:
-    """Return the first few of many names, and the number of the other names."""
+    """Return the first names of a list, followed by the number of the remaining names."""
     shown = showable(", ".join(names[:_SHOWN]).replace("\n", r"\n"))
     return shown + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
 

@@ -86,7 +86,7 @@ def _digests(folder: Path, names: Iterable[str]) -> dict[str, str]:
 
 
 def read_checksums(folder: Path) -> dict[str, str]:
-    """Return name -> digest of the listed files; empty if there is no SHA256SUMS.
+    """Return a dict from file name to digest; the dict is empty if SHA256SUMS does not exist.
 
     Raises:
         UserError: A line does not have the format of `sha256sum`.

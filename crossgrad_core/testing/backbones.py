@@ -1,4 +1,4 @@
-"""Contract checks of backbones: blocks, decoding, gradients, checkpoints, topology edits."""
+"""Contract checks for backbones: blocks, decoding, gradients, checkpoints, density control."""
 
 from collections.abc import Mapping
 
@@ -27,25 +27,25 @@ from crossgrad_core.testing.support.contract import (
 )
 from crossgrad_core.wording import listed
 
-#: Steps at which decoding is checked: before the first step, early, and at the end.
+#: Steps in which decoding is checked: before training, after one step, and at the end.
 _STEPS = (0, 1, 30_000)
-#: Maximum change of parameters from their initial values.
+#: Maximum change of each parameter from its initial value.
 _STEP = 0.02
-#: Maximum difference and mean difference of two renders whose float32 values were computed in
-#: different ways. A few Gaussians then appear in or disappear from a pixel at their edge, where
+#: Largest difference and largest mean difference between two renders that should be equal except
+#: for float32 rounding. Rounding can add or remove a Gaussian at the edge of its footprint, where
 #: alpha is 1/255.
 _PIXEL, _MEAN = 0.02, 2e-4
 
 
 def created(backbone: Backbone, seed: int = 0) -> Parameters:
-    """Create parameters for the sample scene, ready for the first step."""
+    """Create parameters for the sample scene, prepared for the first step."""
     scene = sample_scene()
     parameters = backbone.create(scene, np.random.default_rng(seed))
     return backbone.prepare(parameters, scene, sample_phase(0))
 
 
 def blocks_cover_the_parameters(make: Make[Backbone]) -> None:
-    """Every trained tensor is in exactly one block; each per-primitive tensor has N rows."""
+    """Every trained tensor is in exactly one block. Each per-primitive tensor has N rows."""
     backbone = make()
     blocks, parameters = backbone.blocks(), created(backbone)
     names = [block.name for block in blocks]
@@ -67,7 +67,7 @@ def blocks_cover_the_parameters(make: Make[Backbone]) -> None:
 
 
 def the_default_densifier_is_there(make: Make[Backbone]) -> None:
-    """`default_densifier` names an installed densifier whose tensors are in the blocks."""
+    """The default densifier is installed, and the blocks contain the tensors that it edits."""
     backbone = make()
     densifier = registry.load(Densifier, backbone.default_densifier)
     lacks = densifier.tensors - {name for block in backbone.blocks() for name in block.tensors}
@@ -76,7 +76,10 @@ def the_default_densifier_is_there(make: Make[Backbone]) -> None:
 
 
 def created_from_the_scene(make: Make[Backbone]) -> None:
-    """Parameters are finite float32 leaves on the CPU, and equal for equal seeds."""
+    """Initial parameters are finite float32 leaf tensors on the CPU.
+
+    Equal seeds give equal parameters.
+    """
     with global_randomness_untouched():
         one, other = created(make()), created(make())
     require(primitives_of(make().blocks(), one) > 0, "create() returns no Gaussians")
@@ -90,7 +93,7 @@ def created_from_the_scene(make: Make[Backbone]) -> None:
 
 
 def decoding_has_the_shape(make: Make[Backbone]) -> None:
-    """Decoding gives valid Gaussians at every step, in training and in evaluation."""
+    """Decoding returns valid Gaussians in all phases of training and evaluation."""
     backbone = make()
     parameters = created(backbone)
     rows = primitives_of(backbone.blocks(), parameters)
@@ -132,7 +135,7 @@ def _require_valid(gaussians: Gaussians, primitives: int) -> None:
 
 
 def positions_are_those_of_primitives(make: Make[Backbone]) -> None:
-    """`positions` is empty or names a tensor [N, 3] with one row for each primitive."""
+    """`positions` is empty, or names a tensor [N, 3] with one row for each primitive."""
     backbone = make()
     parameters = created(backbone)
     held = [name for block in backbone.blocks() if block.per_primitive for name in block.tensors]
@@ -144,7 +147,10 @@ def positions_are_those_of_primitives(make: Make[Backbone]) -> None:
 
 
 def axes_are_those_of_primitives(make: Make[Backbone]) -> None:
-    """`axes` is empty or names primitive tensors [N, 3] and [N, 4] of a backbone with positions."""
+    """`axes` is empty, or names per-primitive tensors [N, 3] and [N, 4].
+
+    Axes also require `positions`.
+    """
     backbone = make()
     parameters = created(backbone)
     held = {name for block in backbone.blocks() if block.per_primitive for name in block.tensors}
@@ -154,7 +160,7 @@ def axes_are_those_of_primitives(make: Make[Backbone]) -> None:
 
 
 def gradients_reach_every_block(make: Make[Backbone]) -> None:
-    """The Gaussians decoded over all views depend on every trained block."""
+    """The decoded Gaussians of all views together depend on every trained block."""
     backbone = make()
     parameters = created(backbone)
     for view in sample_scene().train_views:
@@ -171,7 +177,7 @@ def gradients_reach_every_block(make: Make[Backbone]) -> None:
 
 
 def _weighted(gaussians: Gaussians) -> Tensor:
-    """Return a sum over all decoded values in which every value has a different weight."""
+    """Return a weighted sum of all decoded values. Every value has a different weight."""
     names = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
     tensors = [getattr(gaussians, name) for name in names]
     given = [tensor.flatten() for tensor in tensors if tensor is not None]
@@ -181,7 +187,7 @@ def _weighted(gaussians: Gaussians) -> Tensor:
 
 
 def checkpoints_give_the_same_gaussians(make: Make[Backbone]) -> None:
-    """Parameters that were saved and loaded decode to the same bits, without randomness."""
+    """Parameters that were saved and loaded decode to bit-identical Gaussians."""
     backbone = make()
     parameters = created(backbone)
     written = save({name: tensor.detach().contiguous() for name, tensor in parameters.items()})
@@ -196,12 +202,12 @@ def checkpoints_give_the_same_gaussians(make: Make[Backbone]) -> None:
 
 
 def edits_keep_rows_together(make: Make[Backbone]) -> None:
-    """After an edit, every row of every per-primitive tensor still belongs to its primitive."""
+    """After an edit, each row of each per-primitive tensor still belongs to its primitive."""
     backbone = make()
     before = created(backbone)
     rows = primitives_of(backbone.blocks(), before)
-    # Drop the last two primitives, repeat the first two at the end, and reverse the remaining
-    # primitives.
+    # The edit removes the last two primitives, reverses the remaining primitives, and adds copies
+    # of the first two at the end.
     source = torch.cat([torch.arange(rows - 3, -1, -1), torch.tensor([0, 1])])
     after = _edited(backbone, before, source)
     for block in backbone.blocks():
@@ -212,7 +218,7 @@ def edits_keep_rows_together(make: Make[Backbone]) -> None:
 
 
 def few_primitives_are_no_error(make: Make[Backbone]) -> None:
-    """One primitive and zero primitives can be prepared and decoded, as after density control."""
+    """A model with one primitive or with no primitives can be prepared and decoded."""
     backbone = make()
     parameters = created(backbone)
     for rows in (1, 0):
@@ -241,7 +247,7 @@ def _require_equal(parameters: Mapping[str, Tensor], copies: Mapping[str, Tensor
 
 
 def baking_gives_plain_gaussians(make: Make[Backbone]) -> None:
-    """Baking for a PLY file gives Gaussians with spherical harmonics, without a graph."""
+    """Baked Gaussians for a PLY file have spherical harmonics and no autograd graph."""
     backbone = make()
     baked = backbone.bake(created(backbone), sample_phase(training=False), [sample_camera()])
     require(baked.sh_dc is not None and baked.colors is None, "bake() does not return sh_dc")
@@ -252,7 +258,7 @@ def baking_gives_plain_gaussians(make: Make[Backbone]) -> None:
 
 
 def plain_ones_bake_what_they_draw(make: Make[Backbone]) -> None:
-    """With `plain`, baked Gaussians give every camera the same image as decoding."""
+    """With `plain`, baked and decoded Gaussians give equal images for every camera."""
     backbone = make()
     if not backbone.plain:
         raise cannot_tell("the backbone does not declare that a standard PLY loses nothing (plain)")
@@ -278,10 +284,10 @@ def plain_ones_bake_what_they_draw(make: Make[Backbone]) -> None:
 
 
 def _grown(parameters: Parameters) -> Parameters:
-    """Move the parameters away from their initial values, so that no value is a round number.
+    """Change the parameters, so that no value is as special as an initial value.
 
-    All parameters increase. Colours therefore stay above 0, because harmonics are clamped there and
-    colours are not.
+    All parameters become larger. With larger parameters, colours stay above 0. Below 0, colours
+    from spherical harmonics are clamped, but plain colours are not.
     """
     rng = np.random.default_rng(5)
 
@@ -296,7 +302,10 @@ def _grown(parameters: Parameters) -> Parameters:
 
 
 def fitting_respects_the_user(make: Make[Backbone]) -> None:
-    """`fitted_to` reports the options that it changed, and keeps every option set by the user."""
+    """`fitted_to` returns a note for each changed option.
+
+    `fitted_to` never changes an option that the user set.
+    """
     backbone = make()
     fitted, notes = backbone.fitted_to(sample_scene())
     explained = fitted == backbone or len(notes) > 0
@@ -308,7 +317,10 @@ def fitting_respects_the_user(make: Make[Backbone]) -> None:
 
 
 def passed_on_tensors_are_handed_over(make: Make[Backbone]) -> None:
-    """A tensor of `passthrough` reaches the Gaussians unchanged; `decode` does not read it."""
+    """A tensor in `passthrough` becomes part of the Gaussians unchanged.
+
+    `decode` does not read the values of this tensor.
+    """
     backbone = make()
     parameters = created(backbone)
     for name in parameters.keys() & set(backbone.passthrough.values()):

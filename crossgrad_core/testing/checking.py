@@ -1,4 +1,4 @@
-"""Runner of a slot's contract checks on an installed plugin, with their results."""
+"""Run the contract checks of a slot on an installed plugin, and return the results."""
 
 import sys
 from collections.abc import Callable
@@ -14,20 +14,21 @@ from crossgrad_core.registry.signatures import defined_at, raised_at
 from crossgrad_core.registry.slots import COMMANDS, OWN_COMMANDS
 from crossgrad_core.wording import in_one_line, listed, singular
 
-#: Function `check(make)` of any slot, see `crossgrad_core.testing.support.contract`.
+#: A check of any slot: a function `check(make)`, described in
+#: `crossgrad_core.testing.support.contract`.
 AnyCheck: TypeAlias = Callable[[Any], None]
 
 
 @dataclass(frozen=True)
 class Result:
-    """The result of one check of one plugin.
+    """The result of one check on one plugin.
 
     Attributes:
         check: Name of the check.
-        failure: Reason why the check failed; None if it passed.
-        skipped: Reason why the check does not apply; None if it applies.
-        where: `file:line` of the failure in the plugin, or the registration of the plugin by its
-            package.
+        failure: Reason why the check failed; None for a check that passed.
+        skipped: Reason why the check does not apply; None for a check that applies.
+        where: `file:line` of the failure in the plugin. If the line is unknown, the entry point
+            that registers the plugin.
     """
 
     check: str
@@ -37,14 +38,17 @@ class Result:
 
 
 def checks_of(slot: str) -> tuple[AnyCheck, ...]:
-    """Return the contract checks of a slot; imports only this slot's checks."""
+    """Return the contract checks of a slot. Only the checks of this slot are imported."""
     module = import_module(f"crossgrad_core.testing.{slot}")
     checks: tuple[AnyCheck, ...] = getattr(module, f"{singular(slot).upper()}_CHECKS")
     return checks
 
 
 def check_entry(entry: registry.Entry) -> list[Result]:
-    """Load a plugin and run every check of its slot; stop early if it cannot be loaded."""
+    """Load a plugin and run all checks of its slot.
+
+    If the plugin cannot be loaded, return only a failed result for the loading.
+    """
     taken = _taken(entry)
     names = (
         [Result("its name is not used by another plugin", failure=taken, where=entry.origin)]
@@ -52,7 +56,9 @@ def check_entry(entry: registry.Entry) -> list[Result]:
         else []
     )
     if taken and entry.slot == COMMANDS:
-        return names  # The command cannot be called at all.
+        # Users cannot call the plugin's command if the core has a command with this name, so the
+        # command cannot be tested.
+        return names
     try:
         loaded = load_command(entry) if entry.slot == COMMANDS else registry.load_entry(entry)
     except UserError as error:
@@ -78,7 +84,10 @@ def check_entry(entry: registry.Entry) -> list[Result]:
 
 
 def _taken(entry: registry.Entry) -> str:
-    """Return the reason why users cannot choose the plugin by its name; empty if they can."""
+    """Return the reason why users cannot choose the plugin by its name.
+
+    The text is empty if users can choose the plugin.
+    """
     if entry.slot == COMMANDS and entry.name in OWN_COMMANDS:
         return f"the core has a command {entry.name}, which is called instead"
     try:
@@ -89,17 +98,23 @@ def _taken(entry: registry.Entry) -> str:
 
 
 def _announced_at(entry: registry.Entry) -> str:
-    """Return the location of the object that an entry point names, as far as it is known."""
+    """Return the source location of the object that an entry point names.
+
+    Without a known location, return the file or the entry point.
+    """
     module, _, name = entry.value.partition(":")
     loaded = sys.modules.get(module.strip())
     thing = getattr(loaded, name.strip(), None)
-    # If the object belongs to another package, its location would not help the author.
+    # If another package defines the object, its location would not help the author of the plugin.
     location = defined_at(thing) if getattr(thing, "__module__", "") == module.strip() else ""
     return location or getattr(loaded, "__file__", None) or entry.origin
 
 
 def _failed(check: str, error: BaseException, package: str, where: str) -> Result:
-    """Return a failure at the innermost line of the package, or else at `where`."""
+    """Return a failed result.
+
+    The location of the failure is the innermost line of the package, or else `where`.
+    """
     where = raised_at(error, package) or where
     if isinstance(error, AssertionError):
         return Result(check, str(error) or "an assertion without a message failed", where=where)

@@ -1,7 +1,7 @@
-"""Contract checks of commands, for the object that an entry point in `crossgrad.commands` names.
+"""Contract checks for commands, which entry points in `crossgrad.commands` register.
 
-These checks take the command itself, `check(my_command)`, because a function cannot be created
-again.
+Checks of commands receive the command itself, `check(my_command)`, and not a function that creates
+the command.
 """
 
 import subprocess
@@ -17,8 +17,8 @@ from crossgrad_core.registry.commands import Command, as_group_member
 from crossgrad_core.testing.support.contract import cannot_tell, require
 from crossgrad_core.wording import listed
 
-#: Libraries with a long import time. A command imports them only after it has printed its first
-#: message.
+#: Libraries that take long to import. A command must print its first message before the import of
+#: one of these libraries.
 HEAVY: Final = ("matplotlib", "numba", "numpy", "pydantic", "scipy", "torch")
 _IMPORTED = """
 import sys
@@ -29,7 +29,7 @@ print(*[name for name in {heavy!r} if name in sys.modules])
 
 
 def help_has_a_first_line(command: Command) -> None:
-    """`crossgrad --help` can describe the command."""
+    """`crossgrad --help` can show a description of the command."""
     text = as_group_member(command, "command").get_short_help_str()
     require(text, "the command has no help: write a docstring, or `typer.Typer(help=...)`")
 
@@ -43,10 +43,10 @@ def help_can_be_shown(command: Command) -> None:
 
 
 def importing_it_is_quick(command: Command) -> None:
-    """The module of the command imports no library with a long import time.
+    """The module of the command imports none of the libraries that take long to import.
 
-    A user must see within two seconds that a command has started. Therefore slow imports belong
-    inside the command's function.
+    A user must see within two seconds that the command has started. Slow imports must therefore be
+    inside the function of the command.
     """
     module = _module(command)
     program = _IMPORTED.format(path=sys.path, module=module, heavy=HEAVY)
@@ -62,7 +62,7 @@ def importing_it_is_quick(command: Command) -> None:
 
 
 def _module(command: Command) -> str:
-    """Return the module that defines the command."""
+    """Return the name of the module that defines the command."""
     if not isinstance(command, typer.Typer):
         return command.__module__
     registered = [member.callback for member in (*command.registered_commands,)]

@@ -1,4 +1,4 @@
-"""Contract checks of densifiers, on a real backbone with artificial screen statistics."""
+"""Contract checks for densifiers, with a real backbone and artificial screen statistics."""
 
 from dataclasses import dataclass, field, replace
 from itertools import count
@@ -45,27 +45,30 @@ from crossgrad_core.testing.support.renders import (
 )
 from crossgrad_core.wording import listed
 
-#: Steps of the published schedule around its second and third edit, at 600 and 700.
+#: Steps of the published schedule before, during and after its second and third edit, at steps 600
+#: and 700.
 _AROUND_EDITS = (*range(596, 602), *range(698, 702))
 _EDIT = 600
 _ROOM = 10_000
-#: Minimum share of the present Gaussians that must remain after one edit.
+#: Smallest share of the Gaussians that must remain after an edit.
 _LEFT = 0.1
-#: Typical gradient of the projected mean, per pixel: for images of the sample scene's size, 2e-5
-#: corresponds to the published threshold in NDC units.
+#: Typical gradient with respect to the projected mean, per pixel. For images of this size, the
+#: published threshold in NDC units corresponds to 2e-5.
 _GRADIENT = 5e-5
 
 
 @dataclass
 class DensifierRun:
-    """A densifier that is called step by step and whose edits are applied, as in a training run.
+    """A densifier that is called step by step, as in a training run.
+
+    The edits of the densifier are applied to the parameters.
 
     Attributes:
         densifier: The densifier.
-        backbone: A backbone with the tensors that the densifier edits.
-        parameters: The parameters.
-        state: The densifier's state.
-        rng: The generator of the hook.
+        backbone: A backbone that has the tensors that the densifier edits.
+        parameters: The present parameters.
+        state: The present state of the densifier.
+        rng: The random generator that the hook receives.
     """
 
     densifier: Densifier
@@ -76,7 +79,7 @@ class DensifierRun:
 
     @classmethod
     def of(cls, densifier: Densifier) -> "DensifierRun":
-        """Make a run at its start.
+        """Create a run before its first step.
 
         Raises:
             SkipTest: No installed backbone has the tensors that the densifier edits.
@@ -90,7 +93,7 @@ class DensifierRun:
         return primitives_of(self.backbone.blocks(), self.parameters)
 
     def context(self, step: int, room: int = _ROOM) -> DensifyContext:
-        """Return the densifier's context for a step in which two views were rendered."""
+        """Return the context of the densifier for a step with two rendered views."""
         fields = {**step_fields(step), "rng": self.rng}
         rasterizer = build(Rasterizer, REFERENCE_RASTERIZER, {})
         return DensifyContext(
@@ -107,7 +110,7 @@ class DensifierRun:
         )
 
     def take_step(self, step: int, room: int = _ROOM) -> Edit:
-        """Call the densifier for a step, apply its edit and return it."""
+        """Call the densifier for a step, apply its edit, and return the edit."""
         edit, state = self.densifier.densify(self.context(step, room), self.state)
         require(isinstance(edit, Edit), f"the result is {edit!r}, not an Edit or NO_EDIT")
         require(isinstance(state, PluginState), f"the new state is {state!r}, not a PluginState")
@@ -143,7 +146,10 @@ class DensifierRun:
 
 
 def _screen(gaussians: int, needs: frozenset[str], seed: tuple[int, int]) -> Screen:
-    """Make statistics: a third of the Gaussians is invisible, most others need densification."""
+    """Create artificial statistics.
+
+    One third of the Gaussians is invisible, and most of the visible ones need densification.
+    """
     rng = np.random.default_rng(seed)
     radii = torch.from_numpy(rng.integers(0, 3, gaussians) * 4).int()
     seen = (radii > 0).float()
@@ -160,7 +166,10 @@ def _screen(gaussians: int, needs: frozenset[str], seed: tuple[int, int]) -> Scr
 
 
 def _directions(radii: Tensor, gradient: Tensor, rng: np.random.Generator) -> Tensor:
-    """Make up to four pixels in each bin; their absolute gradients sum to twice `gradient`."""
+    """Create up to four pixels in each of six direction bins.
+
+    The absolute gradients of these pixels sum to twice the absolute value of `gradient`.
+    """
     shape = (radii.shape[0], 6, 4)
     angles = torch.from_numpy(rng.uniform(0.0, 2.0 * np.pi, shape)).float()
     there = torch.from_numpy(rng.random(shape) < 0.5).float()  # noqa: PLR2004 - each value is 1 with probability one half
@@ -172,10 +181,14 @@ def _directions(radii: Tensor, gradient: Tensor, rng: np.random.Generator) -> Te
 
 
 def _backbone_for(densifier: Densifier) -> Backbone:
-    """Return a backbone that uses this densifier by default, or that has the tensors it edits."""
+    """Return a backbone for the densifier.
+
+    If possible, the backbone uses this densifier by default. In any case, the backbone has the
+    tensors that the densifier edits.
+    """
     fitting = []
-    # If several backbones are suitable, use the first backbone. Crossgrad's own backbones come
-    # first.
+    # If several backbones are suitable, the first one is used. Backbones of crossgrad precede the
+    # backbones of other packages.
     candidates = sorted(
         entries("backbones").values(), key=lambda entry: entry.distribution != "crossgrad"
     )
@@ -185,7 +198,7 @@ def _backbone_for(densifier: Densifier) -> Backbone:
             have = {tensor for block in backbone.blocks() for tensor in block.tensors}
             default = load("densifiers", backbone.default_densifier)
         except (Exception, SystemExit):
-            # If a backbone of another package is broken, this is not an error of the densifier.
+            # A broken backbone of another package is not an error of the densifier.
             continue
         if densifier.tensors <= have:
             fitting.append((type(densifier) is not default, backbone))
@@ -196,7 +209,7 @@ def _backbone_for(densifier: Densifier) -> Backbone:
 
 
 def require_good(edit: Edit, blocks: tuple[Block, ...], parameters: Parameters) -> None:
-    """Require that an edit can be applied and that its values are finite."""
+    """Require that an edit matches the parameters and that its values are finite."""
     misfit = misfit_of(edit, blocks, parameters)
     require(not misfit, f"the edit is inconsistent: {misfit}")
     plain = all(type(number) is int for number in edit.counts.values())
@@ -204,7 +217,7 @@ def require_good(edit: Edit, blocks: tuple[Block, ...], parameters: Parameters) 
     number = primitives_of(blocks, parameters) if edit.source is None else len(edit.source)
     for name, overwrite in edit.values.items():
         values, rows = overwrite.values, overwrite.rows
-        # A run would broadcast a smaller tensor over the rows, which is hardly ever intended.
+        # A training run would copy a smaller tensor to all rows, which is almost never intended.
         wanted = (number if rows is None else len(rows), *parameters[name].shape[1:])
         shape = tuple(values.shape)
         require(shape == wanted, f"edit.values of {name} has the shape {shape}, expected {wanted}")
@@ -212,7 +225,10 @@ def require_good(edit: Edit, blocks: tuple[Block, ...], parameters: Parameters) 
 
 
 def its_needs_are_statistics(make: Make[Densifier]) -> None:
-    """`needs` names optional outputs that rasterizers may provide; other names refuse every run."""
+    """`needs` contains only optional outputs that a rasterizer may provide.
+
+    With any other name, no run could start.
+    """
     statistics = ("depth", "pixels", "abs_gradient", "directions", "count")
     more = sorted(make().needs.difference(statistics))
     require(
@@ -221,7 +237,7 @@ def its_needs_are_statistics(make: Make[Densifier]) -> None:
 
 
 def quiet_before_its_time(make: Make[Densifier]) -> None:
-    """No edit is made up to and including step `densify_from`."""
+    """The densifier makes no edit before or at step `densify_from`."""
     run = DensifierRun.of(make())
     for step in (1, 100, 499, 500):
         edit = run.take_step(step)
@@ -229,7 +245,10 @@ def quiet_before_its_time(make: Make[Densifier]) -> None:
 
 
 def edits_keep_everything_aligned(make: Make[Densifier]) -> None:
-    """Edits are valid; afterwards parameters and statistics have one row per primitive."""
+    """Edits are valid.
+
+    After an edit, all per-primitive parameters and statistics have one row for each primitive.
+    """
     run = DensifierRun.of(make())
     for step in _AROUND_EDITS:
         run.take_step(step)
@@ -242,7 +261,7 @@ def edits_keep_everything_aligned(make: Make[Densifier]) -> None:
 
 
 def never_outgrows_the_room(make: Make[Densifier]) -> None:
-    """At most `context.room` primitives are added."""
+    """An edit adds at most `context.room` primitives."""
     for room in (0, 1, 5):
         run = DensifierRun.of(make())
         for step in range(_EDIT - 4, _EDIT):
@@ -254,7 +273,10 @@ def never_outgrows_the_room(make: Make[Densifier]) -> None:
 
 
 def most_primitives_survive(make: Make[Densifier]) -> None:
-    """No edit removes nearly all primitives of a sound model; training could not restore them."""
+    """No edit removes nearly all primitives of a good model.
+
+    Training could not replace so many removed primitives.
+    """
     run = DensifierRun.of(make())
     for step in range(_EDIT - 4, _EDIT + 1):
         before = run.primitives
@@ -268,7 +290,7 @@ def most_primitives_survive(make: Make[Densifier]) -> None:
 
 
 def same_seed_same_edits(make: Make[Densifier]) -> None:
-    """The edits depend only on the arguments; random numbers come from `context.rng`."""
+    """Edits depend only on the arguments, and random numbers come from `context.rng`."""
     with global_randomness_untouched():
         one, other = DensifierRun.of(make()), DensifierRun.of(make())
         for step in _AROUND_EDITS:
@@ -278,7 +300,7 @@ def same_seed_same_edits(make: Make[Densifier]) -> None:
 
 
 def resumes_exactly(make: Make[Densifier]) -> None:
-    """A run resumed from a checkpoint makes the same edits as an uninterrupted run."""
+    """A resumed run makes the same edits as an uninterrupted run."""
     whole, broken = DensifierRun.of(make()), DensifierRun.of(make())
     for step in _AROUND_EDITS:
         whole.take_step(step)
@@ -299,7 +321,7 @@ def _require_same(one: DensifierRun, other: DensifierRun, otherwise: str) -> Non
 
 
 def inputs_stay_untouched(make: Make[Densifier]) -> None:
-    """Parameters change only through the returned edit, and the old state never changes."""
+    """Parameters change only through the returned edit, and the old state does not change."""
     run = DensifierRun.of(make())
     for step in _AROUND_EDITS:
         copies: dict[str, Tensor] = {n: t.detach().clone() for n, t in run.parameters.items()}

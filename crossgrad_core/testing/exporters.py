@@ -1,4 +1,4 @@
-"""Contract checks of exporters."""
+"""Contract checks for exporters."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,7 +14,7 @@ from crossgrad_core.testing.support.components import COMPONENT_CHECKS
 from crossgrad_core.testing.support.contract import Check, Make, cannot_tell, require
 
 _FRAME = Similarity(np.array([1.0, -2.0, 3.0]), 0.5)
-#: Rounding error of a few float32 operations on numbers of about 1.
+#: Rounding error after a few float32 operations on numbers near 1.
 _ROUNDING = 1e-5
 
 
@@ -26,7 +26,10 @@ def has_a_suffix(make: Make[Exporter]) -> None:
 
 
 def writes_one_file(make: Make[Exporter]) -> None:
-    """Only the named file is written; equal Gaussians give equal bytes and are not modified."""
+    """Only the named file is written.
+
+    Equal Gaussians give equal bytes, and `write` does not change the Gaussians.
+    """
     with TemporaryDirectory() as folder:
         first, second = (Path(folder) / name for name in ("a", "b"))
         for path in (first, second):
@@ -47,7 +50,7 @@ def writes_one_file(make: Make[Exporter]) -> None:
 
 
 def appears_at_once(make: Make[Exporter]) -> None:
-    """An existing file is replaced as a whole and is never overwritten in place."""
+    """An existing file is replaced as a whole. The exporter never overwrites a file in place."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "a"
         make().write(ExportContent(_gaussians(), _FRAME), path)
@@ -64,7 +67,7 @@ def appears_at_once(make: Make[Exporter]) -> None:
 
 
 def writes_the_input_frame(make: Make[Exporter]) -> None:
-    """Another offset or scale of the local frame changes the coordinates in the file."""
+    """If the offset or scale of the local frame changes, the coordinates in the file change."""
     exporter, given = make(), _gaussians()
     offset = Similarity(_FRAME.offset + np.array([8.0, 16.0, -4.0]), _FRAME.scale)
     scale = Similarity(_FRAME.offset, 4.0 * _FRAME.scale)
@@ -84,7 +87,10 @@ def writes_the_input_frame(make: Make[Exporter]) -> None:
 
 
 def what_it_writes_is_read_again(make: Make[Exporter]) -> None:
-    """`read` gives the positions, sizes and opacities of `stored`, up to float32 rounding."""
+    """`read` returns positions, sizes and opacities of the result of `stored`.
+
+    The values may differ by float32 rounding.
+    """
     exporter = make()
     if type(exporter).read is Exporter.read:
         raise cannot_tell("crossgrad writes files of this format but does not read them")
@@ -97,7 +103,7 @@ def what_it_writes_is_read_again(make: Make[Exporter]) -> None:
         len(read_back) == len(stored),
         f"{len(stored)} Gaussians were written, but {len(read_back)} were read",
     )
-    # Positions lose their last bits, because the offset of the input frame is large.
+    # The large offset of the input frame removes the last bits of positions.
     size = float(np.abs(_FRAME.offset).max()) * _FRAME.scale
     for name in ("means", "scales", "opacities"):
         error = float((getattr(read_back, name) - getattr(stored, name)).abs().max())
@@ -109,7 +115,7 @@ def what_it_writes_is_read_again(make: Make[Exporter]) -> None:
 
 
 def the_stored_ones_can_be_drawn(make: Make[Exporter]) -> None:
-    """`stored` returns as many finite Gaussians as it got, and does not change its input."""
+    """`stored` returns as many finite Gaussians as it received, and does not change its input."""
     given = _gaussians()
     stored = make().stored(given, _FRAME)
     require(isinstance(stored, Gaussians), f"stored() returns {stored!r}, not Gaussians")

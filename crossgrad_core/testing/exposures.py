@@ -1,4 +1,4 @@
-"""Contract checks of exposures."""
+"""Contract checks for exposures."""
 
 from collections.abc import Mapping
 
@@ -11,12 +11,13 @@ from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.testing.support.components import COMPONENT_CHECKS
 from crossgrad_core.testing.support.contract import Check, Make, cannot_tell, require
 
-#: Largest difference between an exposure that is projected once and one that is projected twice.
+#: Largest difference between parameters that were projected once and parameters that were projected
+#: twice.
 _ROUNDING = 1e-5
 
 
 def fitting_gives_an_installed_one(make: Make[Exposure]) -> None:
-    """`fitted_to` returns a `Fitted`: an exposure, the name of another exposure, and notes."""
+    """`fitted_to` returns a `Fitted` with an exposure, the name of its type, and notes."""
     exposure = make()
     fitted = exposure.fitted_to(sample_scene())
     require(isinstance(fitted, Fitted), f"fitted_to() returns {fitted!r}, not a Fitted")
@@ -30,14 +31,17 @@ def fitting_gives_an_installed_one(make: Make[Exposure]) -> None:
 
 
 def every_photo_has_a_start(make: Make[Exposure]) -> None:
-    """Each parameter starts with one finite float32 row per training photo, and is trained."""
+    """Each parameter is trained, and starts with one finite float32 row for each training photo."""
     for name, parameter in make().per_photo(sample_scene()).items():
         _require_rows(f"the initial value of {name}", parameter.first())
         require(parameter.lr.initial > 0, f"the learning rate of {name} is {parameter.lr.initial}")
 
 
 def an_image_stays_an_image(make: Make[Exposure]) -> None:
-    """An image of any size or range stays finite, keeps its shape and type, and is not modified."""
+    """An image of any size or value range stays finite and keeps its shape and type.
+
+    The input is not modified.
+    """
     exposure, values = make(), _first(_starts(make()))
     for image in (_image(), _image()[:5, :9], 3.0 * _image() - 1.0, torch.zeros(4, 4, 3)):
         kept = image.clone()
@@ -51,7 +55,7 @@ def an_image_stays_an_image(make: Make[Exposure]) -> None:
 
 
 def gradients_reach_render_and_values(make: Make[Exposure]) -> None:
-    """The exposed image is differentiable in the render and in every value."""
+    """The exposed image has gradients with respect to the render and to every parameter."""
     exposure = make()
     values = {name: row.clone().requires_grad_() for name, row in _first(_starts(exposure)).items()}
     image = _image().requires_grad_()
@@ -68,7 +72,10 @@ def gradients_reach_render_and_values(make: Make[Exposure]) -> None:
 
 
 def projected_values_stay_projected(make: Make[Exposure]) -> None:
-    """The projection keeps names and shapes, does not change its input, and is idempotent."""
+    """A projection keeps names and shapes and does not change its input.
+
+    A second projection changes nothing.
+    """
     exposure = make()
     values = {name: tensor + _noise(tensor) for name, tensor in _starts(exposure).items()}
     if not values:
@@ -85,7 +92,10 @@ def projected_values_stay_projected(make: Make[Exposure]) -> None:
 
 
 def a_view_that_was_not_seen_has_values(make: Make[Exposure]) -> None:
-    """Held-out views get finite values of the same shape as training photos."""
+    """Held-out views get finite parameters.
+
+    The parameters of held-out views have the shapes of the parameters of training photos.
+    """
     exposure, scene = make(), sample_scene()
     starts = _starts(exposure)
     for view in scene.test_views:
@@ -97,7 +107,7 @@ def a_view_that_was_not_seen_has_values(make: Make[Exposure]) -> None:
 
 
 def same_input_same_bits(make: Make[Exposure]) -> None:
-    """The exposed image depends only on the render and the values."""
+    """The exposed image depends only on the render and the parameters."""
     values = _first(_starts(make()))
     one, two = (make().apply(_image(), values) for _ in range(2))
     require(torch.equal(one, two), "two calls return different images")

@@ -1,4 +1,4 @@
-"""Small scenes in memory, complete or as camera positions, and contexts of hooks for them."""
+"""Small scenes in memory, with or without content, and hook contexts for these scenes."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,7 +19,7 @@ from crossgrad_core.contract.schedule import Phase, Schedule
 from crossgrad_core.contract.slots.sampler import Sampler
 
 WIDTH, HEIGHT, FOCAL = 24, 16, 20.0
-#: Length of the schedule in the test contexts: the published length.
+#: Length of the schedule in the contexts: the published length.
 STEPS = 30_000
 _VIEWS, _POINTS = 12, 40
 _NEAR_RADIUS, _FAR_RADIUS, _STEP = 0.4, 0.8, 0.02
@@ -28,10 +28,10 @@ _CLOUD = 0.1
 
 @dataclass(frozen=True)
 class NoisePhoto:
-    """A photo of random pixels that are the same in every call.
+    """A photo with random pixels, which are equal in every call.
 
     Attributes:
-        seed: Seed of the pixels.
+        seed: Seed of the random pixels.
     """
 
     seed: int
@@ -42,16 +42,19 @@ class NoisePhoto:
         return torch.from_numpy(rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8))
 
     def mask(self) -> Tensor | None:
-        """Return None, because every pixel counts."""
+        """Return None, because all pixels are valid."""
         return None
 
 
 @cache
 def sample_scene() -> Scene:
-    """Make six near and six far cameras around a small cloud; every fourth view is held out.
+    """Create a small point cloud that six near and six far cameras surround.
 
-    The cameras of each regime are in a separate folder and at different distances, so that every
-    grouping finds its groups. The frame is a local frame: the extent of its cameras is 1.
+    Every fourth view is held out.
+
+    The cameras of each regime are in their own folder and at their own range of distances. Every
+    grouping therefore finds its groups. The scene is already in a local frame: the extent of its
+    cameras is 1.
     """
     rng = np.random.default_rng(7)
     cloud = rng.uniform(-_CLOUD, _CLOUD, (_POINTS, 3))
@@ -61,7 +64,10 @@ def sample_scene() -> Scene:
 
 
 def _view(index: int) -> View:
-    """Make view `index`: the first half is far and high, the second half near and low."""
+    """Create view `index`.
+
+    The first half of the views is far and high, the second half near and low.
+    """
     far = index < _VIEWS // 2
     angle = 2.4 * index
     radius = (_FAR_RADIUS if far else _NEAR_RADIUS) + _STEP * index
@@ -82,7 +88,10 @@ def sample_camera() -> Camera:
 
 
 def sample_gaussians(number: int = 30, *, harmonics: bool = False) -> Gaussians:
-    """Make float32 Gaussians of a few pixels in the sample scene; all are leaves with gradients."""
+    """Create float32 Gaussians of a few pixels for the sample scene.
+
+    All tensors are leaf tensors that require gradients.
+    """
     rng = np.random.default_rng(3)
 
     def leaf(values: NDArray[np.float64]) -> Tensor:
@@ -105,12 +114,12 @@ def sample_gaussians(number: int = 30, *, harmonics: bool = False) -> Gaussians:
 
 
 def sample_phase(step: int = STEPS, *, training: bool = True) -> Phase:
-    """Return a phase of a run of the published length; by default the last step."""
+    """Return the phase of a step in a run of the published length. The default is the last step."""
     return Phase(step, training, Schedule.for_run(STEPS))
 
 
 def step_fields(step: int = 1) -> dict[str, Any]:
-    """Return the fields that the contexts of all hooks have in common."""
+    """Return the fields that all hook contexts share."""
     return {
         "step": step,
         "schedule": Schedule.for_run(STEPS),
@@ -139,7 +148,10 @@ def posed_view(
     focal: float = 4.0,
     seen: Sequence[int] = (),
 ) -> View:
-    """Make a 4 x 4 view from `center` [3] along `forward` [3], upright along `up` [3]."""
+    """Create a 4 x 4 view at `center` [3].
+
+    The view looks along `forward` [3], and its top is towards `up` [3].
+    """
     z = _unit(np.asarray(forward, dtype=np.float64))
     x = _unit(np.cross(z, np.asarray(up, dtype=np.float64)))
     rotation = np.stack([x, np.cross(z, x), z])
@@ -151,7 +163,10 @@ def posed_view(
 
 
 def posed_scene(views: Sequence[View], points: ArrayLike = (), test: Sequence[int] = ()) -> Scene:
-    """Make a scene of the given views; all views except those in `test` are training views."""
+    """Create a scene of the given views.
+
+    All views except the views in `test` are training views.
+    """
     cloud = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     train = tuple(i for i in range(len(views)) if i not in set(test))
     colors = np.zeros((len(cloud), 3), dtype=np.uint8)
@@ -166,14 +181,14 @@ class SamplerRun:
     Attributes:
         sampler: The sampler.
         scene: The scene.
-        groups: Labels of the training views, or None.
-        views_per_step: K; None uses the sampler's default.
-        steps: Length of the schedule.
-        losses: [N] reported loss of each training view.
-        rng: The generator of the hook.
-        state: The sampler's state.
-        step: Number of steps taken.
-        last: The last step's record.
+        groups: Labels of the training views; None without groups.
+        views_per_step: Number of views K in each step; None uses the sampler's default.
+        steps: Number of steps in the schedule.
+        losses: [N] loss of each training view, as reported to the sampler.
+        rng: The random generator that the hook receives.
+        state: The present state of the sampler.
+        step: Number of completed steps.
+        last: The record of the last step.
     """
 
     sampler: Sampler
@@ -210,7 +225,7 @@ class SamplerRun:
             yield self.draw()
 
     def context(self) -> SampleContext:
-        """Return the sampler's context in the present step."""
+        """Return the context of the sampler for the present step."""
         views = self.scene.train_views
         centers = [view.camera.center.numpy() for view in views]
         return SampleContext(

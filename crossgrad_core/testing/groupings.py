@@ -1,4 +1,4 @@
-"""Contract checks of groupings."""
+"""Contract checks for groupings."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,21 +22,21 @@ from crossgrad_core.wording import listed
 
 @dataclass(frozen=True)
 class SampleProbe:
-    """Gradients of views that agree within a regime and conflict between regimes.
+    """Artificial gradients of views. Gradients agree within a regime and conflict between regimes.
 
     Attributes:
-        scene: The scene that gives the regimes.
+        scene: The scene whose views have the regimes.
     """
 
     scene: Scene
 
     @property
     def blocks(self) -> tuple[str, ...]:
-        """The two blocks of the Gramians."""
+        """The two blocks for which Gramians exist."""
         return ("means", "f_dc")
 
     def gramians(self, views: Sequence[int]) -> NDArray[np.float64]:
-        """Return Gramians [2, V, V]."""
+        """Return the Gramians [2, V, V] of V views, for both blocks."""
         names = [self.scene.train_views[view].regime for view in views]
         same = np.array([[one == other for other in names] for one in names])
         gramian = np.where(same, 0.9, -0.5) + 0.1 * np.eye(len(names))
@@ -44,13 +44,16 @@ class SampleProbe:
 
 
 def fitted(grouping: Grouping, scene: Scene, seed: int = 0) -> GroupingRule:
-    """Return the rule that a grouping fits to a scene."""
+    """Return the rule that a grouping derives from a scene."""
     probe: GradientProbe | None = SampleProbe(scene) if grouping.needs_probe else None
     return grouping.fit(scene, np.random.default_rng(seed), probe)
 
 
 def every_view_has_a_declared_label(make: Make[Grouping]) -> None:
-    """Each view has one label, declared in `labels` (unless the user's input names it)."""
+    """Each view has one label.
+
+    If `labels` is not empty, `labels` contains the label of each view.
+    """
     grouping, scene = make(), sample_scene()
     rule = fitted(grouping, scene)
     require(isinstance(rule, GroupingRule), f"the result is {rule!r}, not a GroupingRule")
@@ -62,7 +65,10 @@ def every_view_has_a_declared_label(make: Make[Grouping]) -> None:
 
 
 def every_group_has_training_views(make: Make[Grouping]) -> None:
-    """A declared group without training views raises an error: samplers draw from all groups."""
+    """If a declared group contains no training views, the grouping raises an error.
+
+    A sampler could not draw from this group.
+    """
     grouping, scene = make(), sample_scene()
     present = set(fitted(grouping, scene).labels(scene.train_views))
     empty = sorted(set(grouping.labels) - present)
@@ -70,7 +76,7 @@ def every_group_has_training_views(make: Make[Grouping]) -> None:
 
 
 def the_rule_is_fitted_on_training_views(make: Make[Grouping]) -> None:
-    """A view's label depends only on the training views and on the view itself."""
+    """The label of a view depends only on the training views and on the view itself."""
     grouping, scene = make(), sample_scene()
     rule = fitted(grouping, scene)
     together = rule.labels(scene.views)
@@ -84,7 +90,10 @@ def the_rule_is_fitted_on_training_views(make: Make[Grouping]) -> None:
 
 
 def the_quantity_is_one_number_per_view(make: Make[Grouping]) -> None:
-    """The split quantity has a name, and one number per view, independent of other views."""
+    """The quantity that is split has a name and one number per view.
+
+    The number does not depend on other views.
+    """
     grouping, scene = make(), sample_scene()
     together = grouping.quantity(scene, scene.views)
     if together is None:
@@ -99,7 +108,7 @@ def the_quantity_is_one_number_per_view(make: Make[Grouping]) -> None:
 
 
 def same_seed_same_labels(make: Make[Grouping]) -> None:
-    """The labels depend only on the arguments; random numbers come from `rng`."""
+    """Labels depend only on the arguments, and random numbers come from `rng`."""
     scene = sample_scene()
     with global_randomness_untouched():
         one = fitted(make(), scene).labels(scene.views)

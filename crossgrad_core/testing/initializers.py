@@ -1,4 +1,4 @@
-"""Contract checks of initializers."""
+"""Contract checks for initializers."""
 
 from contextlib import suppress
 from dataclasses import fields
@@ -19,10 +19,10 @@ from crossgrad_core.testing.support.contract import (
 
 
 def adds_points(make: Make[Initializer]) -> None:
-    """Each point has a position, a colour, a size above 0 and an opacity between 0 and 1.
+    """Each added point has a position, a colour, a size above 0, and an opacity between 0 and 1.
 
-    A size or an opacity may be NaN. An initializer that can work alone is also tested on a scene
-    without points; it may raise an error there if it finds no points.
+    The size and the opacity may also be NaN. An initializer with `alone = True` is also tested on a
+    scene without points. If an initializer finds no points, it may raise an error.
     """
     start = make()
     _require_points(start.more_points(sample_scene()))
@@ -52,13 +52,13 @@ def _require_points(more: object) -> None:
 
 
 def answers_alike(make: Make[Initializer]) -> None:
-    """Another call, even on a new object, gives the same points and the same messages."""
+    """A second call, even on a new object, returns equal points and equal messages."""
     scene = sample_scene()
     with global_randomness_untouched():
         one, other = make(), make()
         first, second = one.more_points(scene), other.more_points(scene)
         same_messages = one.messages(scene) == other.messages(scene)
-    require(same_messages, "remarks() returns different notes in two calls")
+    require(same_messages, "messages() returns different texts in two calls")
     require((first is None) == (second is None), "points are added in only one of two calls")
     if first is not None and second is not None:
         for field in fields(first):

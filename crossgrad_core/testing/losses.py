@@ -1,4 +1,4 @@
-"""Contract checks of losses."""
+"""Contract checks for losses."""
 
 import torch
 from torch import Tensor
@@ -8,12 +8,15 @@ from crossgrad_core.testing.support.components import COMPONENT_CHECKS
 from crossgrad_core.testing.support.contract import Check, Make, require
 
 _HEIGHT, _WIDTH = 24, 32
-#: Relative difference between two orders of summation in float32.
+#: Relative difference between float32 sums with a different order of summation.
 _ROUNDING = 1e-5
 
 
 def is_a_finite_scalar_with_a_gradient(make: Make[Loss]) -> None:
-    """The loss is one finite number, and the render gets a finite gradient that is not zero."""
+    """The loss is one finite number.
+
+    The gradient with respect to the render is finite and not zero.
+    """
     for mask, weights in ((None, None), (_mask(), None), (None, _weights()), (_mask(), _weights())):
         value, gradient = _taken(make(), _render(), mask, weights)
         require(
@@ -21,12 +24,12 @@ def is_a_finite_scalar_with_a_gradient(make: Make[Loss]) -> None:
             f"the loss has the shape {list(value.shape)}, not the shape of a scalar",
         )
         require(value.isfinite(), f"the loss is {value.item()}")
-        require(gradient.isfinite().all(), "the gradient by the render is not finite")
+        require(gradient.isfinite().all(), "the gradient with respect to the render is not finite")
         require(gradient.any(), "the render receives no gradient from a photo that differs from it")
 
 
 def is_smallest_where_render_and_photo_agree(make: Make[Loss]) -> None:
-    """A render equal to the photo has a smaller loss than another render."""
+    """A render that equals the photo has a smaller loss than any other tested render."""
     loss, same = make(), _photo().float() / 255
     best = loss.loss(same, _photo(), None, None)
     other = loss.loss(_render(), _photo(), None, None)
@@ -34,7 +37,7 @@ def is_smallest_where_render_and_photo_agree(make: Make[Loss]) -> None:
 
 
 def masked_pixels_do_not_count(make: Make[Loss]) -> None:
-    """Pixels with a False mask do not change the loss and get no gradient."""
+    """Pixels for which the mask is False do not change the loss, and their gradient is 0."""
     loss, mask = make(), _mask()
     value, gradient = _taken(loss, _render(), mask, None)
     require(not gradient[~mask].any(), "the render receives a gradient where the mask is False")
@@ -44,7 +47,7 @@ def masked_pixels_do_not_count(make: Make[Loss]) -> None:
 
 
 def nothing_that_counts_is_no_loss(make: Make[Loss]) -> None:
-    """If no pixel counts, by mask or by weight, the loss and its gradient are 0."""
+    """If all pixels are masked or have weight 0, the loss and its gradient are 0."""
     nothing = torch.zeros(_HEIGHT, _WIDTH)
     for mask, weights in ((nothing.bool(), None), (None, nothing)):
         value, gradient = _taken(make(), _render(), mask, weights)
@@ -54,7 +57,7 @@ def nothing_that_counts_is_no_loss(make: Make[Loss]) -> None:
 
 
 def equal_weights_change_nothing(make: Make[Loss]) -> None:
-    """Equal weights of any value give the loss without weights."""
+    """If all pixels have equal weights, the loss equals the loss without weights."""
     loss = make()
     plain = loss.loss(_render(), _photo(), _mask(), None)
     for level in (1.0, 0.25):
@@ -66,7 +69,7 @@ def equal_weights_change_nothing(make: Make[Loss]) -> None:
 
 
 def weights_count(make: Make[Loss]) -> None:
-    """Pixels with weight 0 get less gradient than pixels with weight 1."""
+    """Pixels with weight 0 receive smaller gradients than pixels with weight 1."""
     left = torch.zeros(_HEIGHT, _WIDTH)
     left[:, : _WIDTH // 2] = 1.0
     _, gradient = _taken(make(), _render(), None, left)
@@ -75,7 +78,7 @@ def weights_count(make: Make[Loss]) -> None:
 
 
 def same_input_same_bits(make: Make[Loss]) -> None:
-    """The loss depends only on its arguments and does not change them."""
+    """The loss depends only on its arguments, and does not change its arguments."""
     render, photo, mask, weights = _render(), _photo(), _mask(), _weights()
     first = make().loss(render, photo, mask, weights)
     require(torch.equal(first, make().loss(render, photo, mask, weights)), "two calls differ")

@@ -1,4 +1,4 @@
-"""Contract checks of metrics."""
+"""Contract checks for metrics."""
 
 from math import isfinite
 
@@ -16,7 +16,7 @@ from crossgrad_core.testing.support.contract import Check, Make, require
 
 
 def names_its_figure(make: Make[Metric]) -> None:
-    """`figure` has a valid column name, a label, and a format for numbers."""
+    """`figure` contains a valid column name, a label, and a number format."""
     figure = getattr(make(), "figure", None)
     require(isinstance(figure, Figure), f"figure is {figure!r}, not a Figure")
     name, label = make().figure.name, make().figure.label
@@ -31,7 +31,7 @@ def names_its_figure(make: Make[Metric]) -> None:
 
 
 def its_columns_are_its_own(make: Make[Metric]) -> None:
-    """The metric's name differs from every column that crossgrad writes in each run."""
+    """The name of the metric differs from all columns that crossgrad itself writes in every run."""
     metric = make()
     first = load(Metric, METRICS.split("+")[0])
     figures = () if type(metric) is first else (first.figure,)
@@ -40,20 +40,23 @@ def its_columns_are_its_own(make: Make[Metric]) -> None:
 
 
 def measures_a_finite_number(make: Make[Metric]) -> None:
-    """Every view gets a finite number or None, even if the render equals the photo."""
+    """For every view, the result is a finite number or None.
+
+    The result is also valid if the render equals the photo.
+    """
     photo = sample_scene().test_views[0].photo.image()
     for render in (_render(), photo, torch.zeros_like(photo)):
         _require_number(make().measure(_compared(render)))
 
 
 def an_empty_mask_is_no_error(make: Make[Metric]) -> None:
-    """If no pixel counts, the result is None or a finite number, without an error."""
+    """If all pixels are masked, the result is None or a finite number. No error is raised."""
     nothing = torch.zeros(_render().shape[:2], dtype=torch.bool)
     _require_number(make().measure(_compared(_render(), nothing)))
 
 
 def masked_pixels_do_not_count(make: Make[Metric]) -> None:
-    """The render's pixels under a False mask do not change the metric."""
+    """Pixels of the render for which the mask is False do not change the metric."""
     mask = torch.ones(_render().shape[:2], dtype=torch.bool)
     mask[2:6, 3:12] = False
     other = _render()
@@ -63,7 +66,7 @@ def masked_pixels_do_not_count(make: Make[Metric]) -> None:
 
 
 def same_input_same_figure(make: Make[Metric]) -> None:
-    """The metric depends only on the compared images and does not change them."""
+    """The metric depends only on the compared images, and does not change these images."""
     compared = _compared(_render())
     one, two = make().measure(compared), make().measure(compared)
     require(one == two, f"two measurements of one render return {one} and {two}")

@@ -1,4 +1,4 @@
-"""Contract checks of observers: they survive every event and every hook keeps an answer."""
+"""Contract checks for observers: events raise no errors, and wrapped hooks return valid results."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
@@ -74,15 +74,15 @@ from crossgrad_core.testing.support.renders import (
 )
 from crossgrad_core.wording import in_one_line
 
-#: The hooks of one run's manager. pluggy gives them no types.
+#: The hooks of one plugin manager; pluggy gives them no types.
 Hooks: TypeAlias = Any
 
 _VIEWS = (0, 4)
-#: Steps of the checks: all of the first steps, then fewer and fewer steps up to the end of a run.
+#: Steps that are checked: all early steps, then fewer and fewer steps up to the end of a run.
 _STEPS = (*range(1, 17), 50, 100, 500, 600, 1_000, 7_000, 15_000, STEPS)
 
 
-#: Hooks that run inside a training step.
+#: Hooks that are called inside a training step. The time of these hooks counts as training time.
 _ON_THE_CLOCK = {
     "crossgrad_sample_views",
     "crossgrad_choose_scales",
@@ -92,16 +92,16 @@ _ON_THE_CLOCK = {
     "crossgrad_densify",
     "crossgrad_after_step",
 }
-#: Number of calls, and time limit for the fastest call. The fastest call counts, because a busy
-#: machine slows only some calls.
+#: Number of calls of a hook, and time limit in seconds for the fastest call. The fastest call is
+#: used, because other programs may slow down some calls.
 _CALLS, _SLOW = 6, 0.1
-#: Number of bytes that an observer may keep per step, and number of steps between two measurements
-#: of the memory.
+#: Number of bytes by which the memory may grow in each step, and number of steps between two memory
+#: measurements.
 _KEPT, _BLOCK = 100_000, 4
 
 
 class _Components:
-    """A replacement for the selected components: a fixed sample, full size, plain sum, no edit."""
+    """Replacements for the selected components: fixed views, full size, plain sum, no edit."""
 
     @hookimpl
     def crossgrad_sample_views(self, context: SampleContext) -> SampleResult:
@@ -122,11 +122,12 @@ class _Components:
 
 @contextmanager
 def _hooks(observer: Observer, seconds: dict[str, float] | None = None) -> Iterator[Hooks]:
-    """Yield the hooks with the observer registered; its output is hidden from the terminal.
+    """Yield the hooks of a manager with the observer. Printed output of the observer is hidden.
 
     Args:
         observer: The observer.
-        seconds: Filled with hook name -> wall time of its fastest call; None measures no times.
+        seconds: Dictionary that receives the wall time of the fastest call of each hook, by name.
+            If `seconds` is None, no times are measured.
     """
     manager = make_manager({"components": _Components(), "observer": observer})
     if seconds is not None:
@@ -161,7 +162,7 @@ def _step_end(hooks: Hooks, step: int, answers: list[Answer]) -> None:
 
 
 def survives_every_event(make: Make[Observer]) -> None:
-    """All events of a run raise nothing, with and without an output folder."""
+    """No event of a run raises an error, with or without an output folder."""
     with TemporaryDirectory() as folder:
         for output_folder in (Path(folder), None):
             observer = make()
@@ -178,7 +179,10 @@ def survives_every_event(make: Make[Observer]) -> None:
 
 
 def _require_survival(hooks: Hooks, observer: Observer, step: int) -> None:
-    """Require that the hooks of a step raise no error; other checks test their results."""
+    """Require that the hooks of a step raise no error.
+
+    Other checks test the results of the hooks.
+    """
     try:
         _step_end(hooks, step, _step_hooks(hooks, observer, step))
         hooks.crossgrad_model_ready(model=_model(step))
@@ -193,7 +197,7 @@ def _require_survival(hooks: Hooks, observer: Observer, step: int) -> None:
 
 
 def the_model_stays_untouched(make: Make[Observer]) -> None:
-    """An observer does not change any tensor of the model."""
+    """The observer does not change any tensor of the model."""
     with _hooks(make()) as hooks:
         _start(hooks, None)
         for step in _STEPS:
@@ -204,7 +208,7 @@ def the_model_stays_untouched(make: Make[Observer]) -> None:
 
 
 def _require_new(model: Model, step: int) -> None:
-    """Require that a model is unchanged since `_model` made it."""
+    """Require that a model is still equal to a new model from `_model`."""
     same = _model(step).parameters
     for name, tensor in model.parameters.items():
         equal = torch.equal(tensor.detach(), same[name].detach())
@@ -223,7 +227,10 @@ def survives_an_early_end(make: Make[Observer]) -> None:
 
 
 def hooks_stay_answered(make: Make[Observer]) -> None:
-    """Wrappers of each hook return a finite answer of the right kind and shape."""
+    """If the observer wraps a hook, the hook still returns a valid result.
+
+    The result is finite and has the right type and shape.
+    """
     run, observer = DensifierRun.of(build(Densifier, NO_DENSIFIER, {})), make()
     with _hooks(observer) as hooks:
         _start(hooks, None)
@@ -260,7 +267,7 @@ def _require_gradients(step: int, aggregated: AggregateResult) -> None:
 
 
 def questions_are_answered_in_kind(make: Make[Observer]) -> None:
-    """Objections, weights, loss terms and edits are valid; only edits change parameters."""
+    """The observer's hooks return valid results. Parameters change only through returned edits."""
     config = RunConfig(scene="sample", device="cpu")
     config, *_ = with_decisions(config, sample_scene())
     selection, _ = select(config, sample_scene(), reader="sample")
@@ -307,7 +314,7 @@ def _require_usable(hooks: Hooks, run: DensifierRun, step: int, scale: float) ->
 
 
 def _require_answer(answer: Answer, kind: type[Answer]) -> None:
-    # Format the answer only after a failure, because formatting takes long.
+    # Format the result only after a failure, because formatting takes long.
     if not isinstance(answer, kind):
         raise ContractError(f"a hook returned {answer!r:.60}, not {kind.__name__}")
     for name, state in answer.states.items():
@@ -318,7 +325,7 @@ def _require_answer(answer: Answer, kind: type[Answer]) -> None:
 
 
 def _model(step: int) -> Model:
-    """Make the model of a new run on the sample scene."""
+    """Create the model of a new run on the sample scene."""
     backbone = build(Backbone, BACKBONE, {})
     rasterizer = build(Rasterizer, REFERENCE_RASTERIZER, {})
     parameters, phase, scene = created(backbone), sample_phase(step), sample_scene()
@@ -346,10 +353,10 @@ def _step_hooks(
     step: int,
     states: Mapping[str, PluginState] = MappingProxyType({}),
 ) -> list[Answer]:
-    """Return the answers of the hooks of a step, called as in the training loop.
+    """Call the hooks of a step as in the training loop, and return their results.
 
-    Gradients of single views are available only if the observer needs them. The first step has no
-    record of a previous step, and its views have no labels.
+    Gradients of single views are available only if the observer declares that they are needed. In
+    the first step, no record of a previous step exists, and views have no labels.
     """
     centers, last = sample_scene().centers, _record(step - 1) if step > 1 else None
     sample = SampleContext(
@@ -375,7 +382,7 @@ def _step_hooks(
 
 
 def states_stay_bounded(make: Make[Observer]) -> None:
-    """The states of wrappers do not grow with the number of steps."""
+    """The states of the observer's wrappers do not grow with the number of steps."""
     observer = make()
     with _hooks(observer) as hooks:
         _start(hooks, None)
@@ -383,7 +390,7 @@ def states_stay_bounded(make: Make[Observer]) -> None:
 
 
 def _states(hooks: Hooks, observer: Observer) -> Iterator[Mapping[str, PluginState]]:
-    """Yield all states after each step of an endless run."""
+    """Yield all states after each step of a run without an end."""
     states: Mapping[str, PluginState] = {}
     for step in count(1):
         for answer in _step_hooks(hooks, observer, step, states):
@@ -396,7 +403,7 @@ def _size(states: Mapping[str, PluginState]) -> int:
 
 
 def nothing_piles_up(make: Make[Observer]) -> None:
-    """The observer's own memory grows only little per step."""
+    """The memory of the observer grows only a little in each step."""
     observer, model = make(), _model(1)
     summed = not observer.needs_separate_gradients
     gradients = aggregate_context(sample_gradients(len(_VIEWS)), summed=summed)
@@ -409,8 +416,8 @@ def nothing_piles_up(make: Make[Observer]) -> None:
             hooks.crossgrad_model_ready(model=model)
             if step % _BLOCK == 0:
                 kept.append(memory())
-    # Ignore the first steps, because the observer then allocates memory that it reuses, such as a
-    # buffer.
+    # Ignore the first steps. In the first steps, an observer may allocate memory that is reused
+    # later, such as a buffer.
     grown = min(later - earlier for earlier, later in pairwise(kept[1:])) / _BLOCK
     require(
         grown <= _KEPT,
@@ -422,7 +429,7 @@ def nothing_piles_up(make: Make[Observer]) -> None:
 
 
 def steps_are_not_held_up(make: Make[Observer]) -> None:
-    """No hook that is called in every step is slow; the fastest of several calls is measured."""
+    """No hook that is called in each step is slow. The fastest of several calls is measured."""
     run, observer = DensifierRun.of(build(Densifier, NO_DENSIFIER, {})), make()
     seconds: dict[str, float] = {}
     with _hooks(observer, seconds) as hooks:

@@ -1,7 +1,8 @@
-"""Contract checks of operators.
+"""Contract checks for operators.
 
-The Gramians of the checks come from gradients that occur in training: zero, repeated, opposite, of
-very different length, very long and very short, and with fewer dimensions than views.
+The Gramians belong to gradients that occur in training. Gradients may be zero, equal, opposite,
+very long, very short, or of very different lengths. Gradients may also span fewer dimensions than
+there are views.
 """
 
 from collections.abc import Iterator
@@ -31,23 +32,25 @@ Array = NDArray[np.float64]
 
 _SIZE = 8
 _KINDS: tuple[BlockKind, ...] = ("geometry", "appearance", "neutral")
-#: Number of steps for which the state is checked.
+#: Number of steps for which the operator's state is checked.
 _STEPS = 4
-#: A power of two, so that scaled gradients have exactly scaled Gramians.
+#: A power of two, so that scaling gradients does not cause rounding errors in Gramians.
 _SCALE = 64.0
 _TOLERANCE = 1e-6
-#: Relative difference between two solutions of the same problem by iterative solvers.
+#: Largest relative difference between two results of an iterative solver for one problem.
 _SOLVED = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class OperatorCase:
-    """Gradients of K views, one block per family, and the context of the operator.
+    """Gradients of K views with the context of the operator.
+
+    Each family of gradients forms a block.
 
     Attributes:
-        families: [B] special property of each block's gradients.
-        gramians: [B, K, K].
-        context: The context.
+        families: [B] names of the families, which describe the gradients.
+        gramians: [B, K, K] Gramians of the gradients.
+        context: The context of the operator.
     """
 
     families: tuple[str, ...]
@@ -56,7 +59,10 @@ class OperatorCase:
 
 
 def operator_case(views: int, step: int = 1, scale: float = 1.0) -> OperatorCase:
-    """Make all families of gradients of `views` views, times `scale`, with a new draw per step."""
+    """Create gradients of all families for `views` views, times `scale`.
+
+    Each step uses other random numbers.
+    """
     rng = np.random.default_rng(step)
     families = dict(_families(rng.normal(size=(views, _SIZE))))
     gradients = scale * np.stack(list(families.values()))
@@ -75,7 +81,7 @@ def operator_case(views: int, step: int = 1, scale: float = 1.0) -> OperatorCase
 
 
 def _families(draw: Array) -> Iterator[tuple[str, Array]]:
-    """Yield name and gradients [K, _SIZE], made from one normally distributed draw."""
+    """Yield the names and gradients [K, _SIZE] of all families, made from a random sample."""
     views = len(draw)
     ramp = np.arange(views)[:, None]
     yield "usual", draw
@@ -94,13 +100,13 @@ def _families(draw: Array) -> Iterator[tuple[str, Array]]:
 def transformed(
     operator: MatrixOperator, case: OperatorCase, state: PluginState = EMPTY_STATE, seed: int = 0
 ) -> tuple[Array, PluginState]:
-    """Return the operator's answer to a case."""
+    """Return the matrices and the state that the operator returns for a case."""
     rng = np.random.default_rng(seed)
     return operator.transform(case.gramians, case.context, state, rng)
 
 
 def _matrix_operator(make: Make[Operator]) -> MatrixOperator:
-    """Return the operator if it computes a matrix.
+    """Return the operator if it is a matrix operator.
 
     Raises:
         SkipTest: The operator needs the gradients themselves.
@@ -112,7 +118,7 @@ def _matrix_operator(make: Make[Operator]) -> MatrixOperator:
 
 
 def matrices_have_the_shape(make: Make[Operator]) -> None:
-    """`transform` returns [B, R, K] float64 for every admitted number of views."""
+    """`transform` returns matrices [B, R, K] in float64 for each supported number of views K."""
     operator = _matrix_operator(make)
     for views in admitted(operator.views):
         case = operator_case(views)
@@ -126,7 +132,7 @@ def matrices_have_the_shape(make: Make[Operator]) -> None:
 
 
 def matrices_are_finite(make: Make[Operator]) -> None:
-    """Finite gradients never give NaN or infinity."""
+    """Finite gradients never lead to NaN or infinity in the matrices."""
     operator = _matrix_operator(make)
     for views in admitted(operator.views):
         case = operator_case(views)
@@ -139,7 +145,7 @@ def matrices_are_finite(make: Make[Operator]) -> None:
 
 
 def one_block_is_enough(make: Make[Operator]) -> None:
-    """Each block is processed separately, so that other blocks do not change its matrix."""
+    """Each block is processed separately: other blocks do not change its matrix."""
     operator = _matrix_operator(make)
     for views in admitted(operator.views):
         case = operator_case(views)
@@ -168,7 +174,7 @@ def _only(case: OperatorCase, block: int) -> OperatorCase:
 
 
 def inputs_stay_untouched(make: Make[Operator]) -> None:
-    """`transform` does not change the Gramians, the context or the old state."""
+    """`transform` does not change the Gramians, the context or the previous state."""
     operator = _matrix_operator(make)
     for views in admitted(operator.views):
         _, state = transformed(operator, operator_case(views))
@@ -183,7 +189,7 @@ def inputs_stay_untouched(make: Make[Operator]) -> None:
 
 
 def same_seed_same_answer(make: Make[Operator]) -> None:
-    """The result depends only on the arguments; random numbers come from `rng`."""
+    """The result depends only on the arguments, and random numbers come from `rng`."""
     operator = _matrix_operator(make)
     for views in admitted(operator.views):
         with global_randomness_untouched():
@@ -200,7 +206,10 @@ def same_seed_same_answer(make: Make[Operator]) -> None:
 
 
 def state_survives_a_checkpoint(make: Make[Operator]) -> None:
-    """After each step the state can be saved, loaded and continued, bit for bit."""
+    """After each step, the state can be saved and loaded.
+
+    A run that continues from the saved state gives a bit-identical next result.
+    """
     operator = _matrix_operator(make)
     for views in admitted(operator.views):
         state, copy = PluginState(), PluginState()
@@ -216,7 +225,7 @@ def state_survives_a_checkpoint(make: Make[Operator]) -> None:
 
 
 def one_view_keeps_its_direction(make: Make[Operator]) -> None:
-    """With one view the answer is a positive multiple of its gradient."""
+    """With a single view, the result is a positive multiple of its gradient."""
     operator = _matrix_operator(make)
     if not operator.views.admits(1):
         raise cannot_tell(f"it needs {operator.views}")
@@ -230,7 +239,10 @@ def one_view_keeps_its_direction(make: Make[Operator]) -> None:
 
 
 def scales_with_the_gradients(make: Make[Operator]) -> None:
-    """Gradients times c > 0 scale the answer by c, so no threshold depends on absolute length."""
+    """If all gradients are multiplied by c > 0, the result is multiplied by c.
+
+    Thresholds must not depend on absolute lengths.
+    """
     operator = _matrix_operator(make)
     for views in admitted(operator.views):
         case, scaled = operator_case(views), operator_case(views, scale=_SCALE)
@@ -238,8 +250,8 @@ def scales_with_the_gradients(make: Make[Operator]) -> None:
         again = transformed(operator, scaled)[0].sum(axis=1)
         lengths = np.sqrt(np.einsum("bkk->bk", case.gramians))
         for family, one, other, length in zip(case.families, weights, again, lengths, strict=True):
-            # The error is divided by the length of the longest summand, because rounding errors are
-            # proportional to it.
+            # The error is compared with the longest summand, because rounding errors are
+            # proportional to its length.
             error = np.abs((one - other) * length).max()
             size = np.abs(one * length).max()
             require(
@@ -251,10 +263,11 @@ def scales_with_the_gradients(make: Make[Operator]) -> None:
 
 
 def views_that_are_alike_count_alike(make: Make[Operator]) -> None:
-    """The order of views in a step has no effect: equal views get equal weights.
+    """The order of the views has no effect: views with equal properties get equal weights.
 
-    The tested views have gradients of equal length with equal angles. With more than two views only
-    a right angle is tested, because methods may process conflicting pairs one after another.
+    All tested gradients have equal lengths and equal angles to each other. With more than two
+    views, only right angles are tested. For conflicting gradients, an operator may process pairs
+    one after another.
     """
     operator = _matrix_operator(make)
     for views in admitted(operator.views):
@@ -277,7 +290,10 @@ def views_that_are_alike_count_alike(make: Make[Operator]) -> None:
 
 
 def _alike(case: OperatorCase, gramians: Array) -> OperatorCase:
-    """Return the case with Gramians of one block; the views do not differ in anything else."""
+    """Return the case with `gramians` for one block.
+
+    Labels, losses and distances of all views are equal.
+    """
     number = gramians.shape[1]
     context = replace(
         case.context,
@@ -290,10 +306,10 @@ def _alike(case: OperatorCase, gramians: Array) -> OperatorCase:
 
 
 def what_it_reads_is_declared(make: Make[Operator]) -> None:
-    """`reads_labels` and `reads_gramians` are correct: inputs that are not read have no effect.
+    """`reads_labels` and `reads_gramians` are correct.
 
-    A run refuses a grouping that no component reads, and a granularity for Gramians that no
-    component reads.
+    The declarations matter: a run refuses a grouping if no component reads labels, and a
+    granularity if no component reads Gramians.
     """
     operator = _matrix_operator(make)
     for views in admitted(operator.views):

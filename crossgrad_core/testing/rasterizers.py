@@ -1,4 +1,4 @@
-"""Contract checks of rasterizers: shapes, gradients, statistics, the common rule set."""
+"""Contract checks for rasterizers: shapes, gradients, statistics, and the common rules."""
 
 from dataclasses import replace
 
@@ -19,7 +19,10 @@ _ROUNDING = 1e-4
 def _drawn(
     rasterizer: Rasterizer, gaussians: Gaussians, level: float = 0.0, *, backward: bool = False
 ) -> Render:
-    """Render with all optional outputs over a grey background, and run the backward pass."""
+    """Render with all optional outputs over a grey background.
+
+    With `backward`, also run the backward pass.
+    """
     background = torch.full((3,), level, device=gaussians.means.device)
     render = rasterizer.render(gaussians, sample_camera(), background, rasterizer.provides)
     if backward:
@@ -28,7 +31,7 @@ def _drawn(
 
 
 def _loss(render: Render) -> Tensor:
-    """Return a weighted sum of the image in which every pixel has a different weight."""
+    """Return a weighted sum of the image. Every pixel has a different weight."""
     weights = torch.linspace(0.5, 1.5, render.image.numel()).reshape(render.image.shape)
     return (render.image * weights.to(render.image)).sum()
 
@@ -43,7 +46,7 @@ def _shape(name: str, tensor: Tensor | None, *expected: int) -> None:
 
 
 def renders_have_the_shape(make: Make[Rasterizer]) -> None:
-    """Image [H, W, 3], alpha [H, W], radii [N] int32 and provided outputs have their shapes."""
+    """Image [H, W, 3], alpha [H, W], radii [N] int32 and optional outputs have the right shapes."""
     rasterizer = make()
     gaussians = moved(sample_gaussians(), device_of(rasterizer))
     render = _drawn(rasterizer, gaussians)
@@ -59,7 +62,7 @@ def renders_have_the_shape(make: Make[Rasterizer]) -> None:
 
 
 def the_background_shows_through(make: Make[Rasterizer]) -> None:
-    """A pixel is the blend plus (1 - alpha) times the background."""
+    """Each pixel is the blended colour plus (1 - alpha) times the background colour."""
     rasterizer = make()
     gaussians = moved(sample_gaussians(), device_of(rasterizer))
     black, white = _drawn(rasterizer, gaussians), _drawn(rasterizer, gaussians, 1.0)
@@ -70,7 +73,7 @@ def the_background_shows_through(make: Make[Rasterizer]) -> None:
 
 
 def nothing_to_draw_is_no_error(make: Make[Rasterizer]) -> None:
-    """Without Gaussians in front of the camera, the image is the background and radii are 0."""
+    """If no Gaussian is in front of the camera, the image is the background and all radii are 0."""
     rasterizer = make()
     device = device_of(rasterizer)
     sample = moved(sample_gaussians(), device)
@@ -86,7 +89,7 @@ def nothing_to_draw_is_no_error(make: Make[Rasterizer]) -> None:
 
 
 def gradients_reach_every_input(make: Make[Rasterizer]) -> None:
-    """Every tensor of the Gaussians gets a finite gradient that is not all zero."""
+    """Every tensor of the Gaussians receives a finite gradient that is not zero everywhere."""
     rasterizer = make()
     for harmonics in (False, True):
         gaussians = moved(sample_gaussians(harmonics=harmonics), device_of(rasterizer))
@@ -154,7 +157,10 @@ def _directions_are_of_pixels(screen: Screen) -> None:
 
 
 def same_input_same_bits(make: Make[Rasterizer]) -> None:
-    """Two renders and their gradients are equal to the last bit, and inputs do not change."""
+    """Two renders of one input and their gradients are bit-identical.
+
+    The input does not change.
+    """
     if not make().deterministic:
         raise cannot_tell("the rasterizer declares that its bits differ between runs")
     results = []
@@ -175,7 +181,7 @@ def same_input_same_bits(make: Make[Rasterizer]) -> None:
 
 
 def dilations_of_gaussians_are_heeded(make: Make[Rasterizer]) -> None:
-    """A dilation of the Gaussians replaces the rasterizer's own dilation."""
+    """A dilation in the Gaussians replaces the dilation option of the rasterizer."""
     rasterizer = make()
     try:
         wider = type(rasterizer)(**{**rasterizer.model_dump(), "dilation": 1.0})
@@ -195,7 +201,10 @@ def dilations_of_gaussians_are_heeded(make: Make[Rasterizer]) -> None:
 
 
 def rows_on_demand_are_asked_for(make: Make[Rasterizer]) -> None:
-    """With `sparse_rows`, only drawn rows are requested; gradients are sparse and bit-equal."""
+    """With `sparse_rows`, only rows of visible Gaussians are requested.
+
+    Gradients are sparse, and equal to dense gradients.
+    """
     rasterizer = make()
     if not rasterizer.sparse_rows:
         return
@@ -229,7 +238,10 @@ def rows_on_demand_are_asked_for(make: Make[Rasterizer]) -> None:
 
 
 def speed_says_where_it_runs(make: Make[Rasterizer]) -> None:
-    """`--rasterizer auto` never selects the rasterizer for a device that it does not support."""
+    """`speed` is 0 for devices that the rasterizer does not support.
+
+    If `speed` is 0, `--rasterizer auto` never selects the rasterizer for the device.
+    """
     rasterizer = make()
     for device in ("cpu", "cuda"):
         speed = rasterizer.speed(device)

@@ -1,4 +1,4 @@
-"""Contract checks of readers: behaviour for folders that are not scenes."""
+"""Contract checks for readers, with folders that are not scenes."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,7 +11,10 @@ from crossgrad_core.testing.support.contract import Check, ContractError, Make, 
 
 
 def foreign_folders_are_not_accepted(make: Make[Reader]) -> None:
-    """`accepts` returns False for an empty or missing folder and for a file; it never raises."""
+    """`accepts` returns False for an empty folder, a missing folder, and a file.
+
+    `accepts` never raises an error.
+    """
     with TemporaryDirectory() as folder:
         file = Path(folder) / "notes.txt"
         for path, what in ((Path(folder), "an empty"), (Path(folder) / "gone", "a missing")):
@@ -21,7 +24,7 @@ def foreign_folders_are_not_accepted(make: Make[Reader]) -> None:
 
 
 def foreign_folders_are_a_user_error(make: Make[Reader]) -> None:
-    """Reading a folder that is not a scene raises a UserError that names the missing file."""
+    """Reading a folder that is not a scene raises a `UserError`."""
     with TemporaryDirectory() as folder:
         for path in (Path(folder), Path(folder) / "gone"):
             try:
@@ -34,7 +37,7 @@ def foreign_folders_are_a_user_error(make: Make[Reader]) -> None:
 
 
 def folders_stay_as_they_are(make: Make[Reader]) -> None:
-    """Neither `accepts` nor a failed `read` writes into the folder."""
+    """Neither `accepts` nor a failed `read` leaves files in the folder."""
     with TemporaryDirectory() as folder:
         make().accepts(Path(folder))
         try:

@@ -1,4 +1,4 @@
-"""Contract checks of recipes."""
+"""Contract checks for recipes."""
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.decision import Decision
@@ -17,7 +17,7 @@ from crossgrad_core.wording import listed
 
 
 def decides_every_setting(make: Make[Recipe]) -> None:
-    """Each setting without a default has exactly one row, in short and in long runs."""
+    """Each setting without a default has exactly one row, in short runs and in long runs."""
     for steps in (30, 3_000, 60_000):
         names = [row.setting for row in make().decide(_facts(steps))]
         missing = [name for name in DECIDED if name not in names]
@@ -27,7 +27,7 @@ def decides_every_setting(make: Make[Recipe]) -> None:
 
 
 def gives_a_reason_in_one_line(make: Make[Recipe]) -> None:
-    """Each row gives a reason, and all of its texts fit in one line."""
+    """Each row contains a reason, and no text of a row has more than one line."""
     for row in make().decide(_facts(3_000)):
         require(isinstance(row, Decision), f"a row is {type(row).__name__}, not a Decision")
         require(row.because, f"the row of {row.setting} contains no reason")
@@ -36,7 +36,7 @@ def gives_a_reason_in_one_line(make: Make[Recipe]) -> None:
 
 
 def names_settings_that_exist(make: Make[Recipe]) -> None:
-    """Each row names a setting of a run or an option of a component."""
+    """Each row names an existing setting of a run, or an option of a component."""
     settings = [*(row.setting for row in make().decide(_facts(3_000))), *make().settings]
     names = {setting.partition(".")[0] for setting in settings}
     unknown = sorted(names - RunConfig.model_fields.keys())
@@ -44,14 +44,14 @@ def names_settings_that_exist(make: Make[Recipe]) -> None:
 
 
 def decides_the_same_again(make: Make[Recipe]) -> None:
-    """The same facts give the same rows, in the same order."""
+    """Equal facts give equal rows in equal order."""
     with global_randomness_untouched():
         first, second = (make().decide(_facts(3_000)) for _ in range(2))
     require(first == second, "two calls return different rows")
 
 
 def _facts(steps: int) -> Facts:
-    """Return the facts about a run on the sample scene."""
+    """Return the properties of a run of `steps` steps on the sample scene."""
     return facts_of(RunConfig(steps=steps, device="cpu"), sample_scene())
 
 

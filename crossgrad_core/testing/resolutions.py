@@ -1,4 +1,4 @@
-"""Contract checks of resolutions."""
+"""Contract checks for resolutions."""
 
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -21,7 +21,7 @@ from crossgrad_core.testing.support.contract import (
 )
 from crossgrad_core.testing.support.growth import require_bounded, size_of
 
-#: Steps of the checks, spread over a run of the published length.
+#: Steps that are checked, evenly spread over a run of the published length.
 _STEPS = tuple(range(1, STEPS + 1, STEPS // 40))
 _BREAK = 20
 
@@ -51,7 +51,7 @@ def _draw(step: int) -> ViewSample:
 
 
 def every_view_has_a_scale(make: Make[Resolution]) -> None:
-    """Each sampled view gets a number above 0 and at most 1, for any number of views."""
+    """For any number of drawn views, each view gets a scale above 0 and at most 1."""
     run = _Run(make())
     for step in _STEPS:
         scales = run.take_step(step)
@@ -65,7 +65,7 @@ def every_view_has_a_scale(make: Make[Resolution]) -> None:
 
 
 def same_seed_same_scales(make: Make[Resolution]) -> None:
-    """The scales depend only on the arguments; random numbers come from `context.rng`."""
+    """Scales depend only on the arguments, and random numbers come from `context.rng`."""
     with global_randomness_untouched():
         one, other = (
             [run.take_step(step) for step in _STEPS] for run in (_Run(make()), _Run(make()))
@@ -74,7 +74,7 @@ def same_seed_same_scales(make: Make[Resolution]) -> None:
 
 
 def resumes_exactly(make: Make[Resolution]) -> None:
-    """A run resumed from a checkpoint has the same scales as an uninterrupted run."""
+    """A resumed run has the same scales as an uninterrupted run."""
     whole, broken = _Run(make()), _Run(make())
     for number, step in enumerate(_STEPS):
         if number == _BREAK:
@@ -88,7 +88,7 @@ def resumes_exactly(make: Make[Resolution]) -> None:
 
 
 def old_states_stay_untouched(make: Make[Resolution]) -> None:
-    """`scales` returns a new state and does not change the old state."""
+    """`scales` returns a new state and does not change the previous state."""
     run = _Run(make())
     for step in _STEPS:
         old = run.state
@@ -106,7 +106,7 @@ def states_stay_bounded(make: Make[Resolution]) -> None:
 
 
 def pixels_add_up(make: Make[Resolution]) -> None:
-    """A step of one view renders more than 0 pixels and at most the view's full size."""
+    """A step with one view counts more than 0 pixels and at most the pixels of a full-size view."""
     resolution, schedule = make().fitted_to(sample_scene()), Schedule.for_run(STEPS)
     for before, after in pairwise((0, *_STEPS)):
         pixels = resolution.pixels(schedule, after) - resolution.pixels(schedule, before)

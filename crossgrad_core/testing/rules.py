@@ -1,4 +1,4 @@
-"""Contract checks of rules: short runs on the sample scene."""
+"""Contract checks for rules, which train short runs on the sample scene."""
 
 from copy import deepcopy
 
@@ -29,13 +29,13 @@ from crossgrad_core.training.start import first_state
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.step import final_edits
 
-#: Number of steps of a run, and the step after which it stops. Weight averages and learning-rate
-#: tails are active by then.
+#: `_STEPS`: number of steps of a run. `_STOP`: the step after which a run is stopped. Weight
+#: averages and learning-rate tails begin before the step `_STOP`.
 _STEPS, _STOP = 8, 6
 
 
 def trains_soundly(make: Make[Rule]) -> None:
-    """A run with the rule trains finite parameters, and a second run gives the same parameters."""
+    """A run with the rule trains finite parameters. A second run gives equal parameters."""
     setup = _setup(make)
     with on_one_thread(), global_randomness_untouched():
         run = train(setup, _STEPS)
@@ -44,7 +44,7 @@ def trains_soundly(make: Make[Rule]) -> None:
 
 
 def goes_on_from_a_checkpoint(make: Make[Rule]) -> None:
-    """A stopped and resumed run ends with the same bits as an uninterrupted run."""
+    """A run that was stopped and resumed ends with the bits of an uninterrupted run."""
     setup = _setup(make)
     with on_one_thread():
         state = first_state(setup)
@@ -61,7 +61,7 @@ def goes_on_from_a_checkpoint(make: Make[Rule]) -> None:
 
 
 def says_why_it_would_do_nothing(make: Make[Rule]) -> None:
-    """`unused` returns a text: the reason why the rule would have no effect, or an empty text."""
+    """`unused` returns the reason why the rule would have no effect, or an empty text."""
     setup = _setup(make)
     reason = make().unused(setup.backbone, setup.scene)
     require(isinstance(reason, str), f"unused() returns {reason!r}, not a string")

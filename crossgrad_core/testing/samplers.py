@@ -1,4 +1,4 @@
-"""Contract checks of samplers."""
+"""Contract checks for samplers."""
 
 from dataclasses import replace
 from functools import cache
@@ -23,10 +23,11 @@ from crossgrad_core.testing.support.contract import (
 )
 from crossgrad_core.testing.support.growth import require_bounded, size_of
 
-#: Number of steps before a run is interrupted, and number of steps after the interruption.
+#: Numbers of steps before and after an interruption of a run.
 _BEFORE, _AFTER = 7, 12
-#: Number of steps within which every training view must be drawn. For uniform draws of one view of
-#: nine, the probability of missing a view is below 9 (8/9)^400 < 1e-19.
+#: Number of steps after which every training view must have been drawn. If a sampler draws one of
+#: nine views at random, the probability that some view is missing after so many steps is below 9
+#: (8/9)^400 < 1e-19.
 _PATIENCE = 400
 
 
@@ -38,7 +39,10 @@ def _groups(grouping: str) -> tuple[str, ...]:
 
 
 def sampler_run(sampler: Sampler, views: int | None = None) -> SamplerRun:
-    """Make a run of the sampler on the sample scene, with the groups that it needs."""
+    """Create a run of the sampler on the sample scene.
+
+    If the sampler needs groups, the views have groups.
+    """
     needed = sampler.default_grouping
     losses = np.random.default_rng(1).uniform(0.05, 0.3, len(sample_scene().train)).tolist()
     groups = None if needed is None else _groups(needed)
@@ -46,7 +50,7 @@ def sampler_run(sampler: Sampler, views: int | None = None) -> SamplerRun:
 
 
 def default_views_are_admitted(make: Make[Sampler]) -> None:
-    """The sampler supports its default K."""
+    """The default number of views per step is a number that the sampler supports."""
     sampler = make()
     require(
         sampler.view_counts.admits(sampler.resolved_views),
@@ -55,19 +59,24 @@ def default_views_are_admitted(make: Make[Sampler]) -> None:
 
 
 def draws_are_training_views(make: Make[Sampler]) -> None:
-    """Every sample contains K positions of training views, and K labels if it has labels."""
+    """Each sample contains K positions of training views.
+
+    A sample with labels contains K labels.
+    """
     sampler = make()
     for views in admitted(sampler.view_counts):
         run = sampler_run(sampler, views)
         for _ in range(_AFTER):
-            # Check the sample before the step, because the step requires a valid sample.
+            # Check the sample first, because `run.draw` works only with a valid sample.
             draw, _ = sampler.sample(run.context(), run.state)
             _require_good(draw, sampler.counts(views), len(run.scene.train))
             run.draw()
 
 
 def _require_good(draw: ViewSample, counts: frozenset[int], available: int) -> None:
-    require(isinstance(draw, ViewSample), f"the sampler returns {draw!r}, not a Draw and a state")
+    require(
+        isinstance(draw, ViewSample), f"the sampler returns {draw!r}, not a ViewSample and a state"
+    )
     require(
         isinstance(draw.views, tuple) and all(type(view) is int for view in draw.views),
         f"the drawn views {draw.views!r} are not a tuple of plain integers",
@@ -85,7 +94,10 @@ def _require_good(draw: ViewSample, counts: frozenset[int], available: int) -> N
 
 
 def draws_hand_on_the_groups(make: Make[Sampler]) -> None:
-    """If the training views have groups, every sample has labels: operators may need them."""
+    """If the training views have groups, every sample contains labels.
+
+    Operators may need the labels.
+    """
     sampler = make()
     if sampler.default_grouping is not None or sampler.own_labels:
         raise cannot_tell("it chooses its own groups")
@@ -101,7 +113,7 @@ def draws_hand_on_the_groups(make: Make[Sampler]) -> None:
 
 
 def every_view_comes(make: Make[Sampler]) -> None:
-    """Each training view is drawn within a limited number of steps."""
+    """Each training view is drawn at least once within a limited number of steps."""
     sampler = make()
     run = sampler_run(sampler)
     missing = set(range(len(run.scene.train)))
@@ -115,7 +127,7 @@ def every_view_comes(make: Make[Sampler]) -> None:
 
 
 def same_seed_same_draws(make: Make[Sampler]) -> None:
-    """The samples depend only on the arguments; random numbers come from `context.rng`."""
+    """Samples depend only on the arguments, and random numbers come from `context.rng`."""
     with global_randomness_untouched():
         one = list(sampler_run(make()).draws(_AFTER))
         other = list(sampler_run(make()).draws(_AFTER))
@@ -123,7 +135,7 @@ def same_seed_same_draws(make: Make[Sampler]) -> None:
 
 
 def resumes_exactly(make: Make[Sampler]) -> None:
-    """A run resumed from a checkpoint draws the same views as an uninterrupted run."""
+    """A resumed run draws the same views as an uninterrupted run."""
     whole, broken = sampler_run(make()), sampler_run(make())
     for _ in range(_BEFORE):
         whole.draw()
@@ -139,7 +151,7 @@ def resumes_exactly(make: Make[Sampler]) -> None:
 
 
 def old_states_stay_untouched(make: Make[Sampler]) -> None:
-    """`sample` returns a new state and does not change the old state."""
+    """`sample` returns a new state and does not change the previous state."""
     run = sampler_run(make())
     for _ in range(_BEFORE):
         old = run.state

@@ -1,4 +1,4 @@
-"""The number of steps that fit into a time budget: measured at the start, revised later."""
+"""Choose the number of steps that fits into a time budget; revise the number during training."""
 
 import logging
 from collections.abc import Callable
@@ -16,20 +16,21 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, unwatched
 from crossgrad_core.training.state import ClockKind, TrainState
 
-#: Each density control edit increases the mean cost of a step by this share of the cost of a step
-#: at the start. The value comes from runs with four edits. During a run, time measurements correct
-#: the cost.
+#: Each edit by density control increases the mean cost of a step. The increase is this share of the
+#: cost of a step at the start. The value was measured in runs with four edits. During a run,
+#: measured times replace this estimate.
 COST_PER_EDIT = 0.2
-#: Maximum number of edits that are counted, because growth slows down.
+#: Maximum number of edits that increase the estimated cost. The number of primitives grows more
+#: slowly after the first edits.
 COUNTED_EDITS = 5
-#: Number of pixels that cost as much time as one Gaussian. Source:
+#: Number of pixels that take as much rendering time as one Gaussian. Source:
 #: `benchmarks/grids/two_views_tuning.yaml`.
 PIXELS_PER_PRIMITIVE = 8.0
 
 
 @dataclass(frozen=True)
 class PrimitiveCounts:
-    """The numbers of primitives of a run.
+    """The numbers of primitives at the start of a run and now.
 
     Attributes:
         start: Number of primitives at the start.
@@ -41,19 +42,25 @@ class PrimitiveCounts:
 
     @classmethod
     def of(cls, setup: Setup, state: TrainState) -> "PrimitiveCounts":
-        """Return the numbers for a run that has reached this state."""
+        """Return the initial and the present number of primitives of a run."""
         return cls(started_with(setup, state), state.primitives(setup))
 
 
 def cost_of_run(setup: Setup, crowd: PrimitiveCounts, steps: int) -> float:
-    """Return the expected cost of a run of `steps` steps; unit: a full-size view at its start."""
+    """Return the expected cost of a run of `steps` steps.
+
+    The unit is the cost of a full-size view at the start.
+    """
     setup = setup.at_length(steps, crowd.start)
     schedule = schedule_for(setup, steps)
     return views_of(setup, schedule, 0, steps) * growth_ahead(setup, crowd, schedule, 0)
 
 
 def cost_ahead(setup: Setup, crowd: PrimitiveCounts, step: int, left: int) -> float:
-    """Return the expected cost of `left` steps after `step`; unit: a full-size view at `step`."""
+    """Return the expected cost of `left` steps after `step`.
+
+    The unit is the cost of a full-size view at `step`.
+    """
     setup = setup.at_length(step + left, crowd.start)
     schedule = setup.schedule.with_length(schedule_for(setup, step + left), step)
     views = views_of(setup, schedule, step, step + left)
@@ -61,12 +68,12 @@ def cost_ahead(setup: Setup, crowd: PrimitiveCounts, step: int, left: int) -> fl
 
 
 def schedule_for(setup: Setup, steps: int) -> Schedule:
-    """Return the schedule that the run would have with this length from its start."""
+    """Return the schedule of the run if its total number of steps were `steps`."""
     return schedule_of(setup.in_force, setup.densifier, steps, setup.schedule.counting)
 
 
 def views_of(setup: Setup, schedule: Schedule, after: int, until: int) -> float:
-    """Return the expected cost of the steps `after + 1` to `until`, in full-size views."""
+    """Return the number of full-size views that cost as much as steps `after + 1` to `until`."""
     resolution = setup.selection.resolution
     views = schedule.pace.views(until) - schedule.pace.views(after)
     pixels = resolution.pixels(schedule, until) - resolution.pixels(schedule, after)
@@ -74,23 +81,23 @@ def views_of(setup: Setup, schedule: Schedule, after: int, until: int) -> float:
 
 
 def growth_ahead(setup: Setup, crowd: PrimitiveCounts, schedule: Schedule, step: int) -> float:
-    """Return the mean cost of a view after `step`, divided by the present cost of a view."""
+    """Return the expected mean cost of a view after `step`, divided by the present cost."""
     if not setup.densifier.edits:
         return 1.0
     ahead = schedule.edits(step)
     if ahead and setup.numbers.growth == "budget":
-        # Some primitive budgets are larger than the number of primitives that any run reaches, for
-        # example near the published length. Without the limit, the cost of these runs would be
-        # overestimated.
+        # Some primitive budgets exceed the number of primitives that a run reaches, for example in
+        # runs of about the published length. Without this limit, the cost of runs with a very large
+        # primitive budget would be overestimated.
         return min(1.0 + COST_PER_EDIT * COUNTED_EDITS, _along_curve(setup, crowd, schedule, step))
     done = schedule.edits_before + schedule.edits() - ahead
     return 1.0 + COST_PER_EDIT * min(ahead, max(0, COUNTED_EDITS - done))
 
 
 def _along_curve(setup: Setup, crowd: PrimitiveCounts, schedule: Schedule, step: int) -> float:
-    """Return the result of `growth_ahead` if growth follows the curve to its budget."""
+    """Return the result of `growth_ahead` if the number of primitives follows the budget curve."""
     cameras = [view.camera for view in setup.train_views]
-    # Cost of a view without Gaussians, in units of Gaussians.
+    # Cost of rendering a view without Gaussians, as an equivalent number of Gaussians.
     empty = fmean(camera.width * camera.height for camera in cameras) / PIXELS_PER_PRIMITIVE
     cost, at, count = 0.0, step, crowd.present
     for edit in schedule.edit_steps(step):
@@ -101,33 +108,35 @@ def _along_curve(setup: Setup, crowd: PrimitiveCounts, schedule: Schedule, step:
 
 
 _LOG = logging.getLogger(__name__)
-#: Minimum number of steps of the timing probe, and minimum number of steps between two readings of
-#: the clock.
+#: Minimum number of timed steps at the start, and minimum number of steps between two later time
+#: measurements.
 PROBE_STEPS = 12
-#: Minimum share of the time budget that the probe uses.
+#: Minimum share of the time budget that the timed steps at the start use.
 PROBE_SHARE = 0.01
-#: Maximum number of restarts of the timing probe after the compilation of a kernel.
+#: Kernels may be compiled during the timed steps. After a compilation, the timed steps are
+#: restarted, at most this number of times.
 _TRIES = 8
-#: Share of the time budget between two readings of the clock.
+#: Minimum share of the time budget between two time measurements.
 LOOK_SHARE = 0.02
-#: The length changes only if the difference is larger than this share of the remaining steps.
+#: The length is changed only if the difference exceeds this share of the remaining steps.
 TOLERANCE = 0.02
-#: A step number that no run reaches, and an earlier step number after which photos have their full
-#: size.
+#: `_NEVER` is a step number that no run reaches. From step `_FULL_SIZE` on, photos always have
+#: their full size.
 _NEVER = 10**9
 _FULL_SIZE = _NEVER - _NEVER // 100
 #: Weight of the newest measurement in the smoothed cost of a step. Smoothing is needed because
-#: views differ and other programs use the machine.
+#: views differ in cost and other programs may slow down the machine.
 SMOOTHING = 0.25
 
 
 def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
-    """Measure how many steps fit into `seconds` of training by the run's clock.
+    """Measure how many steps fit into `seconds` of training, on the clock that the run uses.
 
-    Kernels must be compiled already. The measurement trains a temporary state, which is discarded.
+    All kernels must have been compiled before. The measured steps train a temporary model, which is
+    discarded.
 
     Returns:
-        The number of steps, a note with the evidence, and the run's `pixel_share`.
+        The number of steps, a note that describes the measurement, and the measured `pixel_share`.
     """
     _LOG.info("timing a few steps to plan %g s of training", seconds)
     probed = replace(unwatched(setup), schedule=_without_edits(setup.schedule))
@@ -143,13 +152,12 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
             lambda steps: cost_of_run(measured, crowd, steps), seconds / seconds_per_step
         )
 
-    # A change of the length may change the number of pixels in the first steps.
+    # The number of steps can affect the image resolution of the first steps.
     fits = fitting(share)
     first = _without_edits(schedule_for(setup, fits), max(fits, 2 * PROBE_STEPS))
     pixels = setup.selection.resolution.pixels(first, PROBE_STEPS) / first.pace.views(PROBE_STEPS)
     if pixels < 1.0:
-        # Delete this state, because its resolution state stores the scale that the views have
-        # reached.
+        # Start from a new state, because the old state has already recorded full-size views.
         del state
         state = first_state(unwatched(setup))
         steps, small = _probed(replace(probed, schedule=first), state, seconds)
@@ -165,19 +173,19 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
 
 
 def most_steps(setup: Setup) -> int:
-    """Return the largest number of steps of a run with a time budget, even if steps are fast."""
+    """Return the largest number of steps that a run with a time budget may have."""
     views = setup.config.max_views
     return _NEVER if views is None else setup.selection.views.steps_of(views)
 
 
 def _probed(setup: Setup, state: TrainState, seconds: float) -> tuple[int, float]:
-    """Return the number of measured steps and the training seconds per view.
+    """Return the number of measured steps, and the training time per view in seconds.
 
-    The measurement repeats the next `PROBE_STEPS` steps, because later steps may render more
+    The measurement always repeats the same `PROBE_STEPS` steps, because later steps may render more
     pixels.
 
     If a kernel is compiled, the measurement restarts. The number of restarts is limited, because a
-    plugin may compile in every step.
+    plugin may compile kernels in every step.
     """
     kind, step, compiled, tries = setup.config.clock, state.step, False, _TRIES
     timed_step(setup, state)
@@ -202,22 +210,24 @@ def _probed(setup: Setup, state: TrainState, seconds: float) -> tuple[int, float
 
 
 class Length(Protocol):
-    """A rule that decides the length of a run during training."""
+    """A rule that changes the number of steps of a run during training."""
 
     def due(self, state: TrainState) -> bool:
-        """Return True if a decision is due after this step."""
+        """Return True if the number of steps must be decided again after this step."""
         ...
 
     def revised(self, setup: Setup, state: TrainState) -> Setup:
-        """Return the setup with the length that is valid from this step on."""
+        """Return the setup with the number of steps that is valid from this step on."""
         ...
 
 
 class Planned:
-    """A recorded length: fixed, or revised at the same steps as in an earlier run.
+    """A length from a record.
+
+    The length is fixed, or changes at the steps at which it changed in an earlier run.
 
     Args:
-        revisions: Pairs of a step and the total number of steps that is valid after it.
+        revisions: Pairs of a step and the total number of steps that is valid after this step.
     """
 
     def __init__(self, revisions: tuple[tuple[int, int], ...] = ()) -> None:
@@ -233,12 +243,12 @@ class Planned:
 
 
 class Timed:
-    """A length that fits into a budget of training seconds, by the run's own clock.
+    """A length that fits into a budget of training seconds.
 
     Args:
-        seconds: The budget.
-        kind: The clock of the budget.
-        most: Largest number of steps of the run, for arbitrarily fast steps.
+        seconds: The time budget, in seconds.
+        kind: The clock that measures the time budget.
+        most: Largest number of steps of the run, even if steps are fast.
     """
 
     def __init__(self, seconds: float, kind: ClockKind = "wall", *, most: int = _NEVER) -> None:
@@ -251,9 +261,10 @@ class Timed:
         self._rewinds = self._seen = self._next = 0
 
     def due(self, state: TrainState) -> bool:
-        """Return True after a number of steps and a share of the budget."""
+        """Return True after at least `PROBE_STEPS` steps and a minimum share of the time budget."""
         if state.rewinds > self._rewinds:
-            # A run records each new length with its step, so that each step may occur only once.
+            # After a rollback, do not revise the length at a step that has been revised before. A
+            # run records only one length for each step.
             self._rewinds, self._next = state.rewinds, self._seen + 1
             self._look(state)
         self._seen = state.step
@@ -262,7 +273,10 @@ class Timed:
         return steps >= PROBE_STEPS and seconds >= LOOK_SHARE * self._seconds
 
     def revised(self, setup: Setup, state: TrainState) -> Setup:
-        """Return the setup with the length that now fits, recorded in its configuration."""
+        """Return the setup with the number of steps that now fits.
+
+        The configuration records this number.
+        """
         # Measure the cost per view, because the number of views per step may change.
         seconds = state.clock.trained(self._kind) - self._clock
         newest = seconds / views_of(setup, setup.schedule, self._step, state.step)
@@ -286,12 +300,14 @@ class Timed:
 
 
 def seconds_ahead(setup: Setup, state: TrainState, each: float) -> float:
-    """Return the expected training seconds of the remaining steps, including growth.
+    """Return the expected training seconds of the remaining steps.
+
+    The estimate includes the cost of added primitives.
 
     Args:
         setup: The run.
-        state: The present state of the run.
-        each: Present seconds per step.
+        state: The present training state.
+        each: Present duration of a step, in seconds.
     """
     schedule, step = setup.schedule, state.step
     now = views_of(setup, schedule, max(0, step - 1), max(1, step))
@@ -300,7 +316,7 @@ def seconds_ahead(setup: Setup, state: TrainState, each: float) -> float:
 
 
 def with_length(setup: Setup, step: int, total: int) -> Setup:
-    """Return the setup of a run at step `step` with a new total of `total` steps."""
+    """Return the setup of a run whose total number of steps changes to `total` at step `step`."""
     changed = zip(setup.config.revisions, setup.config.revised, strict=False)
     settings = {done: settings for (done, _), settings in changed}.get(step, {})
     setup = replace(setup, revised={**setup.revised, **settings})
@@ -311,7 +327,7 @@ def with_length(setup: Setup, step: int, total: int) -> Setup:
 
 
 def replay_length(setup: Setup, step: int) -> Setup:
-    """Return the setup as it was after `step` steps of the run."""
+    """Return the setup with all changes of the length that the run recorded up to `step`."""
     for done, total in setup.config.revisions:
         if done <= step:
             setup = with_length(setup, done, total)
@@ -319,7 +335,7 @@ def replay_length(setup: Setup, step: int) -> Setup:
 
 
 def _with_notes(setup: Setup, instead_of: Setup) -> Setup:
-    """Return the setup with new notes about its length in place of outdated notes."""
+    """Replace the notes about the old length by notes about the new length."""
     gone = {*notes_on_length(instead_of), *_length_note(instead_of)}
     kept = (note for note in setup.notes if note not in gone)
     return replace(setup, notes=(*kept, *notes_on_length(setup), *_length_note(setup)))
@@ -335,7 +351,10 @@ def _length_note(setup: Setup) -> tuple[str, ...]:
 
 
 def _told(before: Setup, after: Setup) -> Setup:
-    """Return the later setup; log a message if its length adds or removes density control."""
+    """Return the setup `after`.
+
+    Log a message if the new length switches density control on or off.
+    """
     was, now = growth_note(before), growth_note(after)
     if was and not now:
         schedule = after.schedule
@@ -351,7 +370,7 @@ def _told(before: Setup, after: Setup) -> Setup:
 
 
 def _without_edits(schedule: Schedule, total: int = _NEVER) -> Schedule:
-    """Return a schedule of typical steps: statistics, all SH bands and levels, no edits."""
+    """Return a schedule for timing: statistics, all SH bands and all levels, but no edits."""
     return replace(
         schedule,
         total=total,
@@ -365,14 +384,15 @@ def _without_edits(schedule: Schedule, total: int = _NEVER) -> Schedule:
 
 
 def _fitting(cost: Callable[[int], float], affordable: float) -> int:
-    """Return the largest number of steps that costs at most `affordable`, at least 1.
+    """Return the largest number of steps that costs at most `affordable`; the result is at least 1.
 
     Args:
-        cost: Number of steps -> expected cost in full-size views; increasing.
-        affordable: Largest cost, in full-size views.
+        cost: Function from a number of steps to the expected cost in full-size views; must
+            increase.
+        affordable: Largest allowed cost, in full-size views.
     """
     fits, too_many = 1, max(2, ceil(affordable) + 1)
-    # The views of these steps have less than full size.
+    # The first upper limit may be too small, because small views cost less than full-size views.
     while cost(too_many) <= affordable and too_many < _NEVER:
         too_many *= 2
     while too_many - fits > 1:

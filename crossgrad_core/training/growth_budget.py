@@ -1,4 +1,4 @@
-"""Limits for density control: a budget of primitives, a growth curve, and the memory."""
+"""Limits for density control: the primitive budget, the budget schedule, and the memory."""
 
 import sys
 from typing import cast
@@ -11,12 +11,12 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.views import Rendered
 
-#: Name of the state that stores the number of primitives at the start of a budgeted run.
+#: Key in `state.states` for the number of primitives at the start of a budgeted run.
 STATE = "budget"
 
 
 def max_new_gaussians(setup: Setup, state: TrainState, rendered: Rendered) -> int:
-    """Return how many primitives the edit of this step may add; 0 if no edit is due."""
+    """Return how many primitives the edit after this step may add; 0 if no edit is due."""
     if not setup.schedule.densifies(state.step):
         return 0
     most, present = _most(setup, state), state.primitives(setup)
@@ -25,7 +25,7 @@ def max_new_gaussians(setup: Setup, state: TrainState, rendered: Rendered) -> in
 
 
 def _most(setup: Setup, state: TrainState) -> int:
-    """Return the largest allowed number of primitives after the edit of this step."""
+    """Return the largest allowed number of primitives after the edit at this step."""
     numbers = setup.numbers
     decided = numbers.max_gaussians == AUTO or "max_gaussians" in setup.config.decided
     if numbers.growth == "unbounded" and not (decided and numbers.max_gaussians):
@@ -38,18 +38,18 @@ def _most(setup: Setup, state: TrainState) -> int:
 def started_with(setup: Setup, state: TrainState) -> int:
     """Return the number of primitives at the start of the run."""
     kept = state.states.get(STATE)
-    # No Gaussian has been added before the first edit, so the present number is the initial number.
+    # Before the first edit, the present number of primitives equals the initial number.
     return state.primitives(setup) if kept is None else cast("int", kept.values["start"])
 
 
 def most_after(setup: Setup, schedule: Schedule, step: int, start: int) -> int:
-    """Return the largest allowed number of primitives after an edit.
+    """Return the largest allowed number of primitives after an edit at `step`.
 
     Args:
         setup: The run.
         schedule: The schedule of the run.
         step: The step of the edit.
-        start: Primitives at the start.
+        start: Number of primitives at the start of the run.
     """
     numbers = setup.numbers
     bound = numbers.max_gaussians
@@ -63,15 +63,18 @@ def most_after(setup: Setup, schedule: Schedule, step: int, start: int) -> int:
 
 
 def curve(event: int, events: int, start: int, budget: int) -> int:
-    """Return the allowed number of primitives after an edit; after the last edit it is `budget`.
+    """Return the allowed number of primitives after edit `event`.
 
-    Source: Taming 3DGS (arXiv 2406.15643), A(x) = (B - S - 2 N) (x / N)^2 + 2 x + S.
+    After the last edit, the result is `budget`.
+
+    Source: Taming 3DGS (arXiv 2406.15643), A(x) = (B - S - 2 N) (x / N)^2 + 2 x + S. Here x is
+    `event`, N is `events`, S is `start` and B is `budget`.
     """
     return (budget - start - 2 * events) * event * event // (events * events) + 2 * event + start
 
 
 def _demand(setup: Setup, state: TrainState, rendered: Rendered) -> Demand:
-    """Return the memory demand of a step for each primitive."""
+    """Return the memory that a step needs for each primitive."""
     per_primitive = sum(
         state.tensors[name][:1].numel() * state.tensors[name].element_size()
         for block in setup.blocks

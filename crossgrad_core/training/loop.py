@@ -30,7 +30,7 @@ from crossgrad_core.training.state import (
 from crossgrad_core.training.step import model_of, sample_context, take_step
 from crossgrad_core.training.views import photo_camera
 
-#: Messages at the first and at the second signal. A third signal ends the process.
+#: Messages after the first and after the second signal. A third signal ends the process at once.
 _WORDS = (
     (
         "stopping: the current state is saved and evaluated first (press again to "
@@ -42,11 +42,12 @@ _WORDS = (
 
 @dataclass
 class Stopper:
-    """A request to stop a run, with its reason.
+    """A request to stop a run, together with its reason.
 
     Attributes:
-        signal: Number of the first signal; None if there was no signal.
-        at_once: True after a second signal; optional work is then skipped.
+        signal: Number of the first signal; None before the first signal.
+        at_once: True after a second signal. If `at_once` is True, optional work, such as the
+            evaluation, is skipped.
         error: Error from outside the training step that ends the run; None without an error.
     """
 
@@ -63,20 +64,20 @@ class Stopper:
         return self.signal is not None or self.error is not None
 
     def fail(self, error: Exception) -> None:
-        """Request the end of the run after the present step, because any thread raised an error."""
+        """Request the end of the run after the present step, because a thread raised an error."""
         self.error = error
 
     @contextmanager
     def installed(self) -> Iterator["Stopper"]:
-        """Handle signals inside the block; this does nothing outside the main thread.
+        """Handle signals inside the block. Outside the main thread, this method does nothing.
 
-        Signals that the process already ignores (`nohup`, background jobs) are still ignored.
+        Signals that the process already ignores (for example under `nohup`) are still ignored.
         """
         before = self._before
         try:
             for number in signal_names():
                 before[number] = signal.signal(number, self._handle)
-        except ValueError:  # Python handles signals only in the main thread.
+        except ValueError:  # Python allows signal handlers only in the main thread.
             yield self
             return
         try:
@@ -87,7 +88,10 @@ class Stopper:
 
     @contextmanager
     def interruptible(self) -> Iterator[None]:
-        """Let a second signal raise KeyboardInterrupt in the block; outside, only record it."""
+        """Let a second signal raise KeyboardInterrupt in the block.
+
+        Outside the block, the signal is only recorded.
+        """
         self._interruptible = not self.at_once
         try:
             yield
@@ -108,7 +112,10 @@ class Stopper:
             raise KeyboardInterrupt
 
     def _end(self, number: int, frame: FrameType | None) -> None:
-        """Call the previous signal handler to end the process, then raise KeyboardInterrupt."""
+        """Call the previous signal handler, which should end the process.
+
+        If the process is still running, raise KeyboardInterrupt.
+        """
         before = self._before.get(number)
         (before if callable(before) else end_at_once)(number, frame)
         raise KeyboardInterrupt
@@ -119,13 +126,16 @@ _VIEWS, _STEPS = 8, 2
 
 
 class Prefetcher:
-    """A prefetcher of photos: copies of the sampler's generator and state draw future views.
+    """A prefetcher of photos.
 
-    The prediction only decides which photos are decoded first. The prediction may be wrong for a
-    sampler that uses the losses of the previous step. The state of the run is not changed.
+    The prefetcher predicts the next views, and threads decode the photos of these views.
+
+    The prefetcher draws the next views with copies of the sampler's random generator and state. The
+    prediction only decides which photos are decoded first. The prediction may be wrong if the
+    sampler uses the losses of the previous step. The prefetcher does not change the training state.
 
     Args:
-        setup: The run.
+        setup: Setup of the run.
     """
 
     def __init__(self, setup: Setup) -> None:
@@ -145,7 +155,9 @@ class Prefetcher:
             self._follow(state)
             self._draw(state)
             views = [setup.train_views[index] for draw in self._draws for index in draw]
-        except Exception:  # The training step will report the error.
+        # Ignore an error of the sampler here. The training step calls the sampler again and reports
+        # the error.
+        except Exception:
             self._blind = True
             return
         scale = max(state.last.scales, default=1.0) if state.last is not None else 1.0
@@ -154,7 +166,10 @@ class Prefetcher:
         setup.photos_ahead.expect(wanted)
 
     def _follow(self, state: TrainState) -> None:
-        """Drop the prediction of the last step; if it was wrong, drop all predictions."""
+        """Drop the prediction for the last step.
+
+        If the prediction for the last step was wrong, drop all predictions.
+        """
         if self._draws and self._step - len(self._draws) == state.step - 1:
             drawn = self._draws.popleft()
             if state.last is not None and state.last.views == drawn:
@@ -182,21 +197,22 @@ class Prefetcher:
         return len(self._draws) >= _STEPS and sum(map(len, self._draws)) >= _VIEWS
 
 
-#: Reason why the loop returned.
+#: Reason why the training loop returned.
 Ending = Literal["finished", "stopped", "paused"]
-#: Number of steps between checks of all parameters. Losses and gradients are checked in every step.
-#: A bad parameter that affects neither the loss nor the gradients, for example of a Gaussian that
-#: is no longer rendered, is found later.
+#: Number of steps between two checks of all parameters. Losses and gradients are checked in every
+#: step. A non-finite parameter may affect neither the loss nor the gradients, for example if its
+#: Gaussian is no longer rendered. The check of all parameters finds such a parameter.
 CHECK_EVERY = 10
-#: Number of steps between copies of the last good state. It is a multiple of `CHECK_EVERY`.
+#: Number of steps between two copies of the last good state. The number is a multiple of
+#: `CHECK_EVERY`.
 SNAPSHOT_EVERY = 100
 
 
 class RunWriter(Protocol):
-    """A writer of a run's results."""
+    """An object that writes the results of a run."""
 
     def evaluate(self, setup: Setup, state: TrainState) -> None:
-        """Evaluate and record a row."""
+        """Evaluate the model and record the metrics."""
         ...
 
     def save(self, setup: Setup, state: TrainState) -> None:
@@ -204,7 +220,7 @@ class RunWriter(Protocol):
         ...
 
     def rewind(self, setup: Setup, step: int) -> None:
-        """Delete the records after `step`."""
+        """Delete all records of steps after `step`."""
         ...
 
 
@@ -216,16 +232,16 @@ def train(
     pauses: Callable[[TrainState], bool] | None = None,
     guard: RollbackGuard | None = None,
 ) -> Ending:
-    """Run the remaining steps of the schedule, or until `pauses` returns True after a step.
+    """Run the remaining steps of the schedule, or stop when `pauses` returns True after a step.
 
-    A `guard` that is reused after a pause can restore states from before the pause. By default,
-    each call creates a new guard.
+    If the caller passes an earlier `guard` after a pause, training can return to a state before the
+    pause. By default, each call creates a new guard.
 
     Raises:
-        TrainingFailedError: A value is NaN or infinite at the start, or again after a rollback. The
-            message names the step, the views and the block.
-        BaseException: An error of a plugin, a photo, the memory or the disk. A note on the error
-            names the step. After any exception, `state` is the last good state.
+        TrainingFailedError: A value is NaN or infinite, either at the start or again after a
+            rollback. The message of the error names the step, the views and the block.
+        BaseException: A plugin, a photo, the memory or the disk caused an error. A note on this
+            error names the step. After any exception, `state` is the last state that was finite.
     """
     check_start(state)
     use_large_pages()
@@ -277,22 +293,22 @@ def _steps(
         pausing = pauses is not None and state.step < last and pauses(state)
         if pausing and _is_good(setup, state, sink, guard):
             return "paused"
-    # A signal may have arrived after the last check of the loop.
+    # A signal may have arrived after the last check inside the loop.
     _is_good(setup, state, sink, guard)
     return "finished" if state.step >= total else "stopped"
 
 
 def timed_step(setup: Setup, state: TrainState) -> StepRecord:
-    """Take one step on the training clock; decoding photos is counted as loading.
+    """Take one step and count its time; the time to decode photos counts as loading time.
 
-    A GPU or other threads may still run the optimizer at the end of the step. The next step waits
-    for them.
+    A GPU or other threads may still run the optimizer when this function returns. The next step
+    waits for the end of the optimizer.
     """
     state.laps = PhaseTimer()
     setup.photos_ahead.taken_cpu()
     record = take_step(setup, state)
     if setup.config.clock == "cpu" or looks_after(setup, state.step):
-        # Finish deferred updates here, so that their time counts for this step.
+        # Finish deferred updates here, so that their time counts for the present step.
         state.late.finish()
     state.laps.leave_out(0.0, setup.photos_ahead.taken_cpu())
     state.laps.lap("other")
@@ -302,9 +318,9 @@ def timed_step(setup: Setup, state: TrainState) -> StepRecord:
 
 
 def _is_good(setup: Setup, state: TrainState, sink: RunWriter, guard: RollbackGuard) -> bool:
-    """Check a state before it is kept, and rewind training if the state is not finite.
+    """Check whether a state is finite before the state is stored; if not, roll training back.
 
-    Return True if the state is good.
+    Return True if the state is finite.
     """
     try:
         guard.check(state)
@@ -343,7 +359,7 @@ def looks_after(setup: Setup, step: int) -> bool:
 
 
 def copies_after(setup: Setup, step: int) -> bool:
-    """Return True if the state after this step is copied for a rollback."""
+    """Return True if the state after this step is copied for a later rollback."""
     return step % SNAPSHOT_EVERY == 0 or saves_after(setup, step)
 
 
@@ -356,8 +372,8 @@ def evaluates_after(setup: Setup, step: int) -> bool:
     """Return True if held-out views are evaluated after this step; False for the last step."""
     every = setup.numbers.eval_every
     first = max(1, setup.config.eval_from)
-    # Evaluate between opacity resets, which occur every tenth of the run, because renders are poor
-    # right after a reset.
+    # Choose steps in the middle between two opacity resets, because renders are poor right after a
+    # reset.
     chosen = "eval_every" not in setup.config.decided
     between = not chosen and setup.schedule.reset_every is not None
     shift = every // 2 if between else 0

@@ -1,4 +1,4 @@
-"""Memory: the peak use, and the number of further primitives that fit."""
+"""Measure the peak memory, and compute how many more primitives fit into the memory."""
 
 import sys
 from collections.abc import Iterable
@@ -11,39 +11,42 @@ from torch import Tensor
 from crossgrad_core.contract.contexts import ViewRecord
 
 #: Number of copies of the parameters that always exist: the parameters and their two moments, once
-#: in the state and once in the snapshot.
+#: in the training state and once in the snapshot.
 STANDING = 6
-#: Number of additional copies of the parameters during an edit, when no autograd graph exists: the
-#: new parameters and moments.
+#: During an edit, the new parameters and their two moments also exist. No autograd graph exists
+#: during an edit.
 EDIT = 3
-#: Memory of the autograd graph of one view until its backward pass ends, in units of the parameters
-#: or of the decoded tensors of the view, whichever is larger. With the numba rasterizer, the
-#: measured value is 2.7.
+#: Memory of the autograd graph of one view until its backward pass ends. The unit is the memory of
+#: the parameters or of the view's decoded tensors, whichever is larger. With the numba rasterizer,
+#: the measured factor is 2.7.
 GRAPH = 3
-#: Share of the available memory that growth may claim.
+#: Largest share of the available memory that new primitives may use.
 GROWTH_SHARE = 0.5
 
 
 def peak_mebibytes(device: torch.device) -> float | None:
-    """Return the peak memory of this process (resident set), or of the GPU, in MiB.
+    """Return the peak memory of this process (resident set) or of the GPU, in MiB.
 
-    None if the system does not report it.
+    Return None if the system does not report the peak memory.
     """
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / 2**20
     try:
         import resource
-    except ImportError:  # Windows
+    except ImportError:  # Windows has no module `resource`.
         return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 def available_bytes(device: torch.device) -> int | None:
-    """Return the bytes that can still be allocated; None if the system does not report them."""
+    """Return the bytes that can still be allocated.
+
+    Return None if the system does not report this number.
+    """
     if device.type == "cuda":
-        # Memory that torch has reserved does not count as free, but torch can use it for new
-        # tensors.
+        # On the GPU, memory that torch has reserved does not count as free. Torch can still use
+        # this memory for new tensors.
         kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
         return torch.cuda.mem_get_info(device)[0] + kept
     figures = [
@@ -72,16 +75,17 @@ def _cgroup_available() -> int | None:
 
 @dataclass(frozen=True)
 class Demand:
-    """Peak memory of a step for each primitive.
+    """The memory that a step needs for each primitive.
 
     Attributes:
-        parameters: Bytes of the parameters.
-        kept: Further bytes in the records of all views: decoded tensors and statistics.
-        views: K.
+        parameters: Bytes of the parameters of one primitive.
+        kept: Bytes of decoded tensors and statistics that the records of all views store, for one
+            primitive.
+        views: Number of views K in the step.
         separate: True if the gradients of the views are stored separately.
         watched: True if the combined gradient must not overwrite the gradient of a view.
-        joint: True if the graphs of all views exist at the same time.
-        copies: Copies of the parameters in the states of rules.
+        joint: True if the autograd graphs of all views exist in parallel.
+        copies: Number of copies of the parameters in the states of rules.
     """
 
     parameters: int
@@ -94,12 +98,15 @@ class Demand:
 
     @property
     def gradients(self) -> int:
-        """Number of simultaneous gradients: one per view, or the sum and the newest gradient."""
+        """Number of gradients that exist in parallel.
+
+        With separate gradients, one for each view; otherwise, the sum and the newest gradient.
+        """
         return self.views + self.watched if self.separate else min(self.views, 2)
 
     @property
     def bytes(self) -> int:
-        """Bytes for each primitive."""
+        """Largest memory during a step for each primitive, in bytes."""
         graphs = self.views if self.joint else 1
         graph = GRAPH * graphs * max(self.parameters, self.kept // self.views)
         standing = STANDING + self.copies
@@ -108,7 +115,7 @@ class Demand:
 
 
 def kept_bytes(records: Iterable[ViewRecord], parameters: Iterable[Tensor]) -> int:
-    """Return the bytes of the tensors in the records of a step, without the parameters."""
+    """Return the bytes of all tensors in the records of a step, except the parameters."""
     parameter_storages = {tensor.untyped_storage().data_ptr() for tensor in parameters}
     held: dict[int, int] = {}
     for record in records:
@@ -123,7 +130,10 @@ def _tensors(values: Iterable[object]) -> Iterable[Tensor]:
 
 
 def room_for_primitives(device: torch.device, demand: Demand) -> int | None:
-    """Return how many more primitives fit into the growth share of the available memory."""
+    """Return how many more primitives may be added.
+
+    New primitives may use the share `GROWTH_SHARE` of the available memory.
+    """
     available = available_bytes(device)
     if available is None:
         return None

@@ -1,4 +1,4 @@
-"""The note on a grouping that splits a distribution with a single mode."""
+"""A note for users whose grouping splits values that form a single cluster."""
 
 import numpy as np
 
@@ -9,13 +9,13 @@ from crossgrad_core.scene.bimodality import ONE_MODE, bimodality
 
 
 def mode_note(name: str, grouping: Grouping, scene: Scene) -> tuple[str, ...]:
-    """Return a note if the quantity that the grouping splits has a single mode, else no note.
+    """Return a note if the values that the grouping splits form a single cluster, else no note.
 
-    The finite-sample form of the bimodality coefficient decides; for small samples, the form with
-    plain moments is used.
+    The test compares the bimodality coefficient with `ONE_MODE`. Small samples use plain moments
+    instead of the finite-sample form.
 
     Args:
-        name: Name of the grouping.
+        name: Name of the grouping, for the note.
         grouping: The grouping.
         scene: The scene.
     """
@@ -24,7 +24,7 @@ def mode_note(name: str, grouping: Grouping, scene: Scene) -> tuple[str, ...]:
         return ()
     measured = bimodality(quantity.values[np.isfinite(quantity.values)])
     figure = measured.deciding
-    # The coefficient is NaN if all values are equal or there are too few values.
+    # The coefficient is NaN if all values are equal or the number of values is too small.
     if not figure < ONE_MODE:
         return ()
     return (

@@ -1,4 +1,4 @@
-"""The decided settings as training reads them: plain values without open settings."""
+"""The settings that training uses, as plain numbers and choices after all decisions."""
 
 from dataclasses import dataclass, fields
 from typing import Literal
@@ -11,7 +11,7 @@ from crossgrad_core.wording import listed
 
 @dataclass(frozen=True)
 class Numbers:
-    """The settings of a run that a recipe decides, each described in `RunConfig`."""
+    """The settings of a run that a recipe can decide. `RunConfig` describes each setting."""
 
     rate_factor: float
     few_pass_rates: bool
@@ -30,10 +30,10 @@ class Numbers:
 
     @classmethod
     def of(cls, config: RunConfig) -> "Numbers":
-        """Return the numbers of a configuration.
+        """Return the settings of a configuration.
 
         Raises:
-            UserError: A number has no value, because no recipe decided it.
+            UserError: A setting has no value, because neither the user nor a recipe set a value.
         """
         values = {field.name: getattr(config, field.name) for field in fields(cls)}
         if missing := [name for name, value in values.items() if value is None]:

@@ -1,6 +1,7 @@
-"""Parameters per photo: stored like a plugin state and optimized by a separate Adam.
+"""Exposure parameters for each photo: stored like the state of a plugin, with an Adam of their own.
 
-The state is a value like a plugin state, so that snapshots, rollback and checkpoints include it.
+Snapshots, rollback and checkpoints include all plugin states, and therefore also the exposure
+parameters.
 """
 
 import json
@@ -24,9 +25,10 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import NonFiniteError, TrainState
 from crossgrad_core.wording import listed
 
-#: Name of the file in a run's folder.
+#: Name of the file in the folder of a run.
 PHOTO_VALUES: Final = "exposure.json"
-#: Version of the format. It is raised if an older reader could misread a newer file.
+#: Version of the file format. Increase this number if an older version of crossgrad could misread a
+#: newer file.
 PHOTO_VALUES_FORMAT: Final = 1
 _TODO = "give the exposure.json of a run, or leave --exposure-from out"
 
@@ -34,13 +36,13 @@ _TODO = "give the exposure.json of a run, or leave --exposure-from out"
 def write_values(
     path: Path, exposure: str, photos: Sequence[str], values: Mapping[str, Tensor]
 ) -> None:
-    """Write the values of photos.
+    """Write the exposure parameters of photos to a file.
 
     Args:
         path: The file.
-        exposure: Name of the exposure that the values belong to.
+        exposure: Name of the exposure model that uses the parameters.
         photos: Names of the photos.
-        values: Name of a parameter -> [P, ...].
+        values: Tensor [P, ...] of each parameter, by name; one row for each photo.
 
     Raises:
         UserError: The disk is full, or the folder is not writable.
@@ -55,14 +57,15 @@ def write_values(
 
 
 def read_values(path: Path, like: Mapping[str, Tensor]) -> dict[str, dict[str, Tensor]]:
-    """Return name of a photo -> name of a parameter -> its value.
+    """Return the parameters of each photo: name of the photo -> name of the parameter -> value.
 
     Args:
         path: The file.
-        like: Name -> [P, ...] values of the run; the file must contain the same names and shapes.
+        like: Name -> [P, ...] parameters of the present run. The file must contain the names and
+            shapes of `like`.
 
     Raises:
-        UserError: The file cannot be read, or contains the values of another exposure.
+        UserError: The file cannot be read, or contains the parameters of another exposure model.
     """
     content = _content(path)
     exposure = content.get("exposure", "another one")
@@ -120,18 +123,19 @@ def _misfit(path: Path, exposure: object, expected: str, found: str) -> UserErro
     )
 
 
-#: Name of this state among the states of plugins.
+#: Key of the exposure parameters in `TrainState.states`.
 STATE = "photos"
 _VALUE, _FIRST, _SECOND, _COUNT = "value", "exp_avg", "exp_avg_sq", "count"
-#: Name -> leaf tensor [...] of one photo.
+#: The parameters of one photo, by name; autograd collects their gradients.
 Leaves = dict[str, Tensor]
 
 
 def started(setup: Setup) -> PluginState | None:
-    """Return the state before the first step; None without parameters per photo.
+    """Return the exposure parameters before the first step; None if the exposure has no parameters.
 
     Raises:
-        UserError: Initial values are not one finite float32 row for each training photo.
+        UserError: The initial values are not finite float32 tensors with one row for each training
+            photo.
     """
     parameters = setup.per_photo
     if not parameters:
@@ -150,12 +154,13 @@ def started(setup: Setup) -> PluginState | None:
 
 
 def known_starts(setup: Setup) -> Mapping[str, Tensor]:
-    """Return the initial values with the values of the user's file; empty without a file.
+    """Return initial values that include the values in the user's file; empty without a file.
 
-    Photos that are not in the file keep their difference from the mean of the photos in the file.
+    A photo that the file does not contain keeps its difference from the mean of the photos in the
+    file.
 
     Raises:
-        UserError: The file contains no training photo, or its values do not fit.
+        UserError: The file contains no training photo, or its values have wrong names or shapes.
     """
     path = setup.config.exposure_from
     if path is None:
@@ -182,10 +187,10 @@ def known_starts(setup: Setup) -> Mapping[str, Tensor]:
 
 
 def check_photos_are(setup: Setup, state: TrainState) -> None:
-    """Check that the state contains the values of exactly the training photos.
+    """Check that the state contains parameters for exactly the training photos.
 
     Raises:
-        UserError: The state contains values of other photos.
+        UserError: The state contains the parameters of other photos.
     """
     held = state.states.get(STATE, EMPTY_STATE).values.get("photos", [])
     names = [view.name for view in setup.train_views] if setup.per_photo else []
@@ -198,7 +203,12 @@ def check_photos_are(setup: Setup, state: TrainState) -> None:
 
 
 def write_photos(setup: Setup, state: TrainState, path: Path) -> bool:
-    """Write the values of all training photos, if there are any; return True if written."""
+    """Write the parameters of all training photos.
+
+    If the exposure has no parameters, write no file.
+
+    Return True if a file was written.
+    """
     values = _values(setup, state)
     if values:
         photos = [view.name for view in setup.train_views]
@@ -207,13 +217,13 @@ def write_photos(setup: Setup, state: TrainState, path: Path) -> bool:
 
 
 def leaves_of(setup: Setup, state: TrainState, index: int) -> Leaves:
-    """Return copies of a training photo's values that collect gradients."""
+    """Return copies of the parameters of a training photo; autograd collects their gradients."""
     values = _values(setup, state)
     return {name: rows[index].detach().clone().requires_grad_() for name, rows in values.items()}
 
 
 def apply(setup: Setup, state: TrainState, view: View, image: Tensor) -> Tensor:
-    """Apply the exposure with its present values to a render of any view."""
+    """Apply the exposure model with its present parameters to a render of any view."""
     values = _values(setup, state)
     row = setup.row_of.get(view.name)
     if row is not None:
@@ -226,26 +236,27 @@ def apply(setup: Setup, state: TrainState, view: View, image: Tensor) -> Tensor:
 def take_photo_step(
     setup: Setup, state: TrainState, taken: Iterable[tuple[int, Leaves]], progress: float
 ) -> None:
-    """Take one Adam step for each photo of the step, then project the values of all photos.
+    """Take an Adam step for the photos of the step, then project the parameters of all photos.
 
-    A photo that was drawn twice takes one step with the sum of its gradients.
+    A photo that occurs twice in the step takes one Adam step with the sum of its gradients.
 
     Args:
-        setup: The run.
-        state: The state of the run, which gets new tensors.
-        taken: Position of each drawn view and its leaves after the backward passes.
-        progress: Completed share of the schedule, for the learning rates.
+        setup: Setup of the run.
+        state: The training state; its exposure parameters are replaced by new tensors.
+        taken: For each drawn view: the row of its photo, and its parameters after the backward
+            pass.
+        progress: Completed share of the schedule, which determines the learning rates.
 
     Raises:
         NonFiniteError: A gradient is NaN or infinite.
-        UserError: The projection does not return valid values for all photos.
+        UserError: The projection does not return valid parameters for all photos.
     """
     if not setup.per_photo:
         return
     held = state.states[STATE]
     tensors = {name: tensor.clone() for name, tensor in held.tensors.items()}
-    # Keep the count on the CPU. A checkpoint may have moved it to the GPU, where each step would
-    # wait for it.
+    # Keep the step counts on the CPU. After a checkpoint is loaded, the step counts may be on the
+    # GPU. With the counts on the GPU, reading a count in each step would wait for the GPU.
     tensors[_COUNT] = tensors[_COUNT].cpu()
     rates = {name: parameter.lr.at(progress) for name, parameter in setup.per_photo.items()}
     for row, gradients in _summed(taken).items():
@@ -268,7 +279,10 @@ def _values(setup: Setup, state: TrainState) -> dict[str, Tensor]:
 
 
 def _summed(taken: Iterable[tuple[int, Leaves]]) -> dict[int, dict[str, Tensor]]:
-    """Return position of a photo -> gradients of its values, summed over repeated draws."""
+    """Return the gradients of each photo's parameters, summed over all draws of the photo.
+
+    The outer keys are rows of photos. The inner keys are names of parameters.
+    """
     gradients_by_row: dict[int, dict[str, Tensor]] = {}
     for row, leaves in taken:
         gradients = gradients_by_row.setdefault(row, {})
@@ -281,7 +295,7 @@ def _summed(taken: Iterable[tuple[int, Leaves]]) -> dict[int, dict[str, Tensor]]
 def _row(
     tensors: Mapping[str, Tensor], row: int, names: Iterable[str], kind: str
 ) -> dict[str, Tensor]:
-    """Return one photo's rows of the tensors of a kind, as views for in-place changes."""
+    """Return the rows of one photo for a kind of tensor, as views that allow changes in place."""
     return {name: tensors[f"{kind}.{name}"][row] for name in names}
 
 
@@ -295,7 +309,10 @@ def _check_gradients(
 
 
 def _is_finite(tensor: Tensor) -> bool:
-    """Return True if finite or on a GPU, where the next loss of the photo shows an error."""
+    """Return True if the tensor is finite or on a GPU.
+
+    On a GPU, the values are not checked, because the next loss of the photo shows the error.
+    """
     return not tensor.is_cpu or bool(torch.isfinite(tensor).all())
 
 

@@ -1,4 +1,4 @@
-"""Gradients of a model for inspection, without training."""
+"""Compute gradients of a model for inspection, without training."""
 
 from collections.abc import Sequence
 
@@ -11,12 +11,12 @@ from crossgrad_core.training.scaled_photos import on_device
 
 
 def view_gradients(model: Model, view: View, tensors: Sequence[str]) -> dict[str, Tensor]:
-    """Return the gradients of one view's photometric loss; the model does not change.
+    """Return the gradients of the photometric loss of one view. The model does not change.
 
     Args:
         model: The model.
         view: Any view of the scene.
-        tensors: Names of tensors of `model.parameters`.
+        tensors: Names of tensors in `model.parameters`.
 
     Returns: Name -> gradient in the shape of its tensor; tensors that are frozen or that the view
     does not touch are absent.

@@ -1,4 +1,4 @@
-"""The learning rates and Adam's averaging rule of a step."""
+"""The learning rates and the moment decay rates of Adam in a step."""
 
 from math import sqrt
 from typing import Final
@@ -9,23 +9,26 @@ from crossgrad_core.training.rules import rate_factor
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.wording import listed
 
-#: Number of columns of positions, of logarithms of standard deviations, and of rotations.
+#: Numbers of columns of the tensors of positions, log scales and rotations.
 _AXES: Final = (3, 3, 4)
 
-#: If a tensor learns in one of n steps, its learning rate is multiplied by n to this power.
+#: If a tensor is updated in one of n steps, its learning rate is multiplied by n to this power.
 RESTED: Final = 0.5
 
 
 def axes_of(setup: Setup) -> tuple[str, str, str] | None:
-    """Return names of the tensors of positions, scales and rotations for steps along axes."""
+    """Return the names of the tensors of positions, scales and rotations.
+
+    Return None if `position_lr` is not `per-axis`.
+    """
     return setup.backbone.gaussian_tensors if setup.numbers.position_lr == "per-axis" else None
 
 
 def check_axes(setup: Setup, parameters: Parameters) -> None:
-    """Check that tensors have the shapes that `Backbone.axes` promises.
+    """Check that the tensors in `Backbone.gaussian_tensors` have the shapes of Gaussians.
 
     Raises:
-        UserError: A shape is wrong. The message names the backbone.
+        UserError: A tensor has a wrong shape. The message names the backbone.
     """
     if (names := setup.backbone.gaussian_tensors) is None:
         return
@@ -42,7 +45,7 @@ def check_axes(setup: Setup, parameters: Parameters) -> None:
 
 
 def rates_at(setup: Setup, step: int) -> dict[str, float]:
-    """Return name of each trained tensor -> its learning rate in a step."""
+    """Return the learning rate of each trained tensor in a step, by tensor name."""
     intervals = setup.update_intervals
     return {
         name: rate_at(setup, block.lr, step) * float(intervals.get(name, 1) ** RESTED)
@@ -52,13 +55,16 @@ def rates_at(setup: Setup, step: int) -> dict[str, float]:
 
 
 def means_rate_at(setup: Setup, step: int) -> float:
-    """Return the learning rate of the primitives' positions in a step; 0 if they do not move."""
+    """Return the learning rate of the positions in a step.
+
+    The rate is 0 if the backbone does not train positions.
+    """
     rates = {block.name: block.lr for block in setup.blocks}
     return rate_at(setup, rates.get("means", LearningRate(0.0)), step)
 
 
 def rate_at(setup: Setup, rate: LearningRate, step: int) -> float:
-    """Return a learning rate of the backbone in a step: its scheduled value times all factors."""
+    """Return a learning rate in a step: its scheduled value, multiplied by all factors."""
     numbers, schedule = setup.numbers, setup.schedule
     factor = numbers.rate_factor * (rate.few_passes if numbers.few_pass_rates else 1.0)
     factor *= rate_factor(setup, rate, step)
@@ -68,7 +74,7 @@ def rate_at(setup: Setup, rate: LearningRate, step: int) -> float:
 
 
 def rule_at(setup: Setup, step: int) -> AdamRule:
-    """Return the averaging rule of Adam in a step."""
+    """Return the Adam rule of a step: decay rates, eps and bias correction."""
     betas = setup.numbers.beta1, setup.numbers.beta2
     if setup.config.batch_rule == "none":
         return AdamRule(betas)

@@ -1,4 +1,4 @@
-"""Named random streams: one generator per purpose, so that one draw never shifts other draws."""
+"""Named random streams: each purpose has its own generator, so that draws stay independent."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any, cast
@@ -15,12 +15,12 @@ STREAMS = (
 def make_streams(
     seed: int, rewinds: int = 0, names: Iterable[str] = STREAMS
 ) -> dict[str, np.random.Generator]:
-    """Return new generators of a run; each rewind of training gives different generators.
+    """Return new generators for a run. After each rollback of training, the generators differ.
 
     Args:
-        seed: Seed of the run.
-        rewinds: How often training was rewound.
-        names: Names of the streams: the streams of every run, and one for each rule.
+        seed: Random seed of the run.
+        rewinds: Number of rollbacks of training so far.
+        names: Names of the streams. A run uses `STREAMS` and one stream for each rule.
     """
     return {name: np.random.default_rng([seed, crc32(name.encode()), rewinds]) for name in names}
 

@@ -1,4 +1,4 @@
-"""Calls of rules: for Gaussians of a view, learning rates, and parameters in evaluations."""
+"""Calls of the hooks of rules: Gaussians, learning rates, and parameters for evaluation."""
 
 from dataclasses import replace
 from math import inf, prod
@@ -15,10 +15,10 @@ from crossgrad_core.training.state import TrainState
 
 
 def view_gaussians(setup: Setup, state: TrainState, context: GaussiansContext) -> Gaussians:
-    """Return the Gaussians from which a training view is rendered.
+    """Return the Gaussians from which a training view is rendered, after changes by rules.
 
     Raises:
-        UserError: A rule gives another number of Gaussians.
+        UserError: A rule returns a different number of Gaussians.
     """
     count = len(context.gaussians)
     for hook in setup.gaussians_hooks:
@@ -31,10 +31,10 @@ def view_gaussians(setup: Setup, state: TrainState, context: GaussiansContext) -
 
 
 def rate_factor(setup: Setup, rate: LearningRate, step: int) -> float:
-    """Return the product of the rules' factors for a learning rate of the backbone in a step.
+    """Return the product of all factors by which rules change a learning rate in a step.
 
     Raises:
-        UserError: A factor is negative or not a finite number.
+        UserError: A rule returns a factor that is negative or not a finite number.
     """
     if not setup.changes_rates:
         return 1.0
@@ -47,10 +47,10 @@ def rate_factor(setup: Setup, rate: LearningRate, step: int) -> float:
 
 
 def eval_parameters(setup: Setup, state: TrainState) -> Parameters:
-    """Return the parameters that evaluations and exports use.
+    """Return the parameters for evaluations and exports, after changes by rules.
 
     Raises:
-        UserError: A rule gives tensors that do not fit the parameters.
+        UserError: A rule returns a tensor whose name or shape does not match the parameters.
     """
     hook, shown = setup.hook.crossgrad_eval_parameters, dict(state.parameters)
     answers: list[dict[str, Tensor]] = hook(states=state.states, step=state.step)

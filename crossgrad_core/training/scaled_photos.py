@@ -1,4 +1,4 @@
-"""Photos reduced by an area filter, cached in a bounded amount of memory."""
+"""Photos reduced by an area filter, in a cache of limited memory."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -10,20 +10,24 @@ from torch import Tensor
 
 from crossgrad_core.contract.scene import Camera, Scene, View
 
-#: Photo [H, W, 3] uint8, and its mask [H, W] bool (None if every pixel counts).
+#: A photo [H, W, 3] uint8, and its mask [H, W] bool (None if all pixels are valid).
 Pair = tuple[Tensor, Tensor | None]
-#: Width and height, pixels.
+#: Width and height in pixels.
 _Size = tuple[int, int]
 
 
 class ScaledPhotos:
-    """A cache of reduced photos: for each view, the last requested size and its source.
+    """A cache of reduced photos.
 
-    The source is the smallest halved copy of the photo that is not smaller than the requested size.
-    If the size changes from step to step, most of the work is done once.
+    The cache stores the last requested size of each photo, and a copy from which nearby sizes are
+    made.
+
+    The copy is halved repeatedly, but is at least as large as the requested size. If the requested
+    size changes in small steps, the halved copy is made only once.
 
     Args:
-        mib: Memory in MiB; photos that do not fit are computed again.
+        mib: Memory for reduced photos, in MiB. Photos that do not fit are computed again for each
+            step.
     """
 
     def __init__(self, mib: int) -> None:
@@ -31,17 +35,19 @@ class ScaledPhotos:
         self._kept: dict[str, dict[_Size, Pair]] = {}
 
     def holds(self, view: View, camera: Camera) -> bool:
-        """Return True if a photo in the size of a camera is available without the full photo."""
+        """Return True if the photo in the camera's size can be made without the full-size photo."""
         kept = self._kept.get(view.name, {})
         return any(size in kept for size in _sizes(view.camera, camera))
 
     def get(self, view: View, camera: Camera, full: Callable[[View], Pair]) -> Pair:
-        """Return the photo and mask of a view in the size of a camera; shared, so read only.
+        """Return the photo and the mask of a view in the camera's size.
+
+        The cache shares the photo and the mask with its callers, so callers must not change them.
 
         Args:
             view: The view.
-            camera: A camera at most as large as the view's camera.
-            full: Returns the photo and the mask as trained.
+            camera: A camera whose image is at most as large as the image of the view's camera.
+            full: Function that returns the full-size photo and mask of a view.
         """
         sizes, before = _sizes(view.camera, camera), self._kept.pop(view.name, {})
         self._room += _bytes(before)
@@ -57,12 +63,13 @@ class ScaledPhotos:
 
 
 class DevicePhotos:
-    """A cache of photos on a GPU, as uint8: for each view, the last requested size.
+    """A cache of photos on a GPU as uint8: for each view, the photo in the last requested size.
 
     Args:
-        scaled: Makes the photos in host memory.
+        scaled: The cache of reduced photos in host memory.
         device: The GPU.
-        mib: GPU memory for photos in MiB; photos that do not fit are copied again for each step.
+        mib: GPU memory for photos, in MiB. Photos that do not fit are copied to the GPU again for
+            each step.
     """
 
     def __init__(self, scaled: ScaledPhotos, device: torch.device, mib: int) -> None:
@@ -71,13 +78,16 @@ class DevicePhotos:
         self._kept: dict[str, tuple[_Size, Pair]] = {}
 
     def holds(self, view: View, camera: Camera) -> bool:
-        """Return True if the photo is cached; see `ScaledPhotos.holds`."""
+        """Return True if the photo is cached on the GPU, or if `ScaledPhotos.holds` is True."""
         held = self._kept.get(view.name)
         here = held is not None and held[0] == (camera.width, camera.height)
         return here or self._scaled.holds(view, camera)
 
     def get(self, view: View, camera: Camera, full: Callable[[View], Pair]) -> Pair:
-        """Return the photo and mask on the GPU; `full` returns them in host memory."""
+        """Return the photo and the mask of a view on the GPU, in the camera's size.
+
+        `full` returns photo and mask in host memory and full size.
+        """
         size = camera.width, camera.height
         held = self._kept.get(view.name)
         if held is not None and held[0] == size:
@@ -100,11 +110,13 @@ def on_device(pair: Pair, device: torch.device) -> Pair:
 
 
 def _sizes(full: Camera, wanted: Camera) -> list[_Size]:
-    """Return the sizes to compute, from the full size (not included) down to the wanted size.
+    """Return the sizes to compute, from the largest to the wanted size.
 
-    There is at most one size in between: the smallest halved size that is not below the wanted
-    size. If the wanted size is itself a halved size, it is made from the photo, so that it does not
-    depend on earlier requests.
+    The full size is not included.
+
+    One intermediate size is possible: the smallest halved size that is not below the wanted size. A
+    wanted size that is itself a halved size is made directly from the full photo. The result
+    therefore does not depend on earlier requests.
     """
     halved, size = (full.width, full.height), (full.width, full.height)
     wanted_size = (wanted.width, wanted.height)
@@ -119,16 +131,16 @@ def _bytes(made: dict[_Size, Pair]) -> int:
 
 
 def reduced(image: Tensor, mask: Tensor | None, width: int, height: int) -> Pair:
-    """Return image and mask reduced by area: each new pixel is the mean of the area that it covers.
+    """Return image and mask reduced by area. Each new pixel is the mean of an area of the image.
 
-    Pixels that do not count are left out of the means. A new pixel counts if at least half of its
-    area counts. A single thread works in a fixed order, so that the bits do not depend on threads.
+    Masked pixels are left out of the means. A new pixel is valid if at least half of its area is
+    valid. A single thread computes all sums in a fixed order, so that the result is repeatable.
 
     Args:
-        image: [H, W, 3] uint8.
-        mask: [H, W] bool, or None.
-        width: At most W.
-        height: At most H.
+        image: [H, W, 3] uint8 photo.
+        mask: [H, W] bool, True for valid pixels; None if all pixels are valid.
+        width: New width, at most W.
+        height: New height, at most H.
     """
     from crossgrad_core.training.numba_kernels.areas import reduce_by_area
 
@@ -142,10 +154,12 @@ def reduced(image: Tensor, mask: Tensor | None, width: int, height: int) -> Pair
 
 @contextmanager
 def decoded_meanwhile(scene: Scene) -> Iterator[None]:
-    """Decode the scene's photos in a thread while the block runs, held-out photos first.
+    """Decode the scene's photos in a thread while the block runs.
 
-    The decoded photos stay in the photo cache if they fit. A photo that cannot be decoded is
-    skipped; the next access to it raises the error.
+    Held-out photos are decoded first.
+
+    Decoded photos stay in the photo cache if the cache is large enough. A photo that cannot be
+    decoded is skipped here. The next access to the photo raises the error.
     """
     over = Event()
     thread = Thread(target=_decode, args=(scene, over), name="crossgrad-photos", daemon=True)

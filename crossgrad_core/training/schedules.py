@@ -1,4 +1,4 @@
-"""The schedule of a run, and the note for a run without density control."""
+"""Create the schedule of a run, and the note for a run that is too short for density control."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -10,10 +10,10 @@ from crossgrad_core.contract.slots.densifier import Densifier
 from crossgrad_core.training.numbers import Numbers
 from crossgrad_core.training.setup import Setup
 
-#: The highest degree of spherical harmonics.
+#: Highest degree of spherical harmonics.
 MOST_DEGREES: Final = 3
 
-#: Times of density control that the user can set.
+#: Settings of the times of density control.
 _EDITS = ("densify_from", "densify_until", "densify_every")
 
 
@@ -22,13 +22,13 @@ def schedule_of(
 ) -> Schedule:
     """Return the schedule of a run of `steps` steps.
 
-    The densifier chooses the times of edits, and explicit settings override them.
+    The densifier chooses when edits occur. Settings by the user override this choice.
 
     Args:
-        config: The configuration; its settings of schedule, edits and SH bands are used.
-        densifier: The densifier.
-        steps: Length of the run.
-        counting: Views of the steps, and photos.
+        config: The configuration. The settings of the schedule, edits and SH bands are used.
+        densifier: The densifier, which chooses when edits occur.
+        steps: Number of steps of the run.
+        counting: Number of views in each step, and number of photos.
     """
     numbers = Numbers.of(config)
     counting = replace(
@@ -36,7 +36,8 @@ def schedule_of(
     )
     schedule = densifier.window(Schedule.for_run(steps, config.schedule, counting))
     edits = _given(config, _EDITS)
-    # A schedule that is not stretched to the run may be longer than the run.
+    # The schedule may be longer than the run, unless the schedule is scaled to the length of the
+    # run.
     length = min(schedule.length, schedule.counted(schedule.total))
     schedule = replace(
         schedule,
@@ -45,7 +46,7 @@ def schedule_of(
         sh_wait=round(numbers.sh_start * length),
         **edits,
     )
-    # Settings that the user chose do not change with the length of the run.
+    # If the user set the times of edits, `min_refinements` must not change these times.
     return replace(schedule, min_refinements=0) if edits else schedule
 
 
@@ -54,14 +55,14 @@ def _given(config: RunConfig, names: tuple[str, ...]) -> Mapping[str, Any]:
 
 
 def notes_on_length(setup: Setup) -> tuple[str, ...]:
-    """Return the notes about a run of this length."""
+    """Return the notes to the user that depend on the length of the run."""
     resolution = setup.selection.resolution
     messages = resolution.messages(setup.schedule)
     return (*growth_note(setup), *messages)
 
 
 def growth_note(setup: Setup) -> tuple[str, ...]:
-    """Return a note if the run is too short for density control, else nothing."""
+    """Return a note if the run is too short for density control, else an empty tuple."""
     schedule = setup.schedule
     if not setup.densifier.edits or schedule.grows:
         return ()

@@ -1,4 +1,4 @@
-"""The parts of a run after its configuration is resolved; training does not change them."""
+"""The setup of a run after its configuration is resolved. Training does not change the setup."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -36,10 +36,10 @@ from crossgrad_core.training.scaled_photos import DevicePhotos, ScaledPhotos
 
 
 def learns_in(step: int, every: int) -> bool:
-    """Return True if a tensor with one update in `every` steps is updated in this step.
+    """Return True if a tensor that is updated once in `every` steps is updated in this step.
 
-    A hash chooses one step of each `every` steps. No photo or regime is therefore left out if a
-    sampler cycles through photos or regimes.
+    A hash function chooses one step of each `every` steps. With a fixed interval, a sampler that
+    cycles through photos or regimes could always skip some photos or regimes.
     """
     turn, offset = divmod(step - 1, every)
     return offset == hash32(turn) * every >> 32
@@ -47,14 +47,15 @@ def learns_in(step: int, every: int) -> bool:
 
 @dataclass(frozen=True)
 class Scale:
-    """The scale of an operator's result at one K, by tensor name.
+    """The scale of an operator's result for K views, by tensor name.
 
     Attributes:
-        per_step: c(K), the factor for K equal gradients: K for their sum, 1 for their mean.
+        per_step: c(K), the factor of the operator for K equal gradients. The factor is K for a sum
+            and 1 for a mean.
         per_view: c(K) / K.
-        to_sum: K / |c(K)|, the factor that brings the result to the scale of the views' sum. Adam
-            receives the scaled result, because its eps and the limits of its arithmetic are
-            absolute.
+        to_sum: K / |c(K)|, a factor that makes the result as large as the sum of the views'
+            gradients. Adam receives the scaled result, because eps and the numerical limits of Adam
+            are absolute.
     """
 
     per_step: Mapping[str, float]
@@ -63,22 +64,27 @@ class Scale:
 
     @classmethod
     def of(cls, sums: Mapping[str, float], views: int) -> "Scale":
-        """Return the scale of an operator with these c(K) at K = `views`."""
+        """Return the scale for K = `views`.
+
+        `sums` contains the operator's factors c(K), by tensor name.
+        """
         shares = {name: value / views for name, value in sums.items()}
-        # An operator that returns zero for equal gradients defines no scale, so use 1.
+        # If an operator returns zero for equal gradients, its result cannot be scaled; use a factor
+        # of 1.
         to_sum = {name: 1.0 / (abs(share) or 1.0) for name, share in shares.items()}
         return cls(sums, shares, to_sum)
 
 
 class OperatorScale:
-    """The factors c(K), which are the sums of an operator's weights for K equal gradients.
+    """The factors c(K): the sum of an operator's weights for K equal gradients.
 
-    The operator is called once for each combination of K and labels, with K equal gradients of one
-    element per tensor, without state. The views differ only in their labels. This defines a scale
-    for every operator: chains, one operator per block, element-wise operators and plugins.
+    The operator is called once for each combination of K and labels. In this call, the operator
+    receives K equal gradients with one element per tensor, and an empty state. In this call, the
+    views differ only in their labels. The measurement works for every operator, also for chains,
+    plugins, and operators that act on blocks or elements.
 
     Args:
-        operator: The operator.
+        operator: The operator to measure.
     """
 
     def __init__(self, operator: Operator) -> None:
@@ -86,7 +92,7 @@ class OperatorScale:
         self._known: dict[tuple[int, tuple[str, ...] | None], Scale] = {}
 
     def of(self, context: AggregateContext) -> Scale:
-        """Return the scale for the K and the labels of this step.
+        """Return the scale for the number of views and the labels of this step.
 
         Raises:
             UserError: The operator's result for equal gradients is not finite.
@@ -117,7 +123,10 @@ class OperatorScale:
 
 
 def neutral(context: AggregateContext) -> AggregateContext:
-    """Return a context of step 1 with K views of equal size, gradients, losses and distances."""
+    """Return an artificial context of step 1.
+
+    The K views of the context have equal gradients, losses, distances and image sizes.
+    """
     views = len(context.losses)
     names = [name for block in context.blocks for name in block.tensors]
     unit = {name: torch.ones(1, dtype=torch.float64) for name in names}
@@ -135,25 +144,26 @@ def neutral(context: AggregateContext) -> AggregateContext:
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """The resolved run.
+    """The resolved components and settings of a run.
 
     Attributes:
-        config: The configuration, with all decisions included.
+        config: The configuration, including all decisions.
         scene: The scene.
-        selection: The chosen components.
-        manager: This run's plugin manager.
-        plugins: Every registered plugin by name.
-        groups: Label of each training view, or None.
-        schedule: The schedule.
-        device: Device of the tensors.
-        notes: Messages about choices and omissions, with reasons.
-        scaled_photos: Cache of reduced photos and of photos on a GPU.
-        photos_ahead: The threads that decode photos in parallel with the steps.
-        decisions: The table of decided settings.
-        decide: Makes the table for another length; a run that repeats another run decides nothing.
-        revised: Settings that changed because a time budget changed the length of the run.
-        pixel_share: Share of the time of a full-size step that is proportional to its pixels, as
-            measured.
+        selection: The selected components.
+        manager: The plugin manager of this run.
+        plugins: All registered plugins, by name.
+        groups: Label of each training view; None without a grouping.
+        schedule: The schedule of the run.
+        device: The device of the tensors.
+        notes: Messages to the user about choices and omissions, with reasons.
+        scaled_photos: The cache of reduced photos, or of photos on the GPU.
+        photos_ahead: The threads that decode photos while steps run.
+        decisions: The decided settings, with their reasons.
+        decide: Function that decides the settings for another length. If a run repeats another run,
+            the function decides nothing.
+        revised: Settings that changed when the time budget changed the length of the run.
+        pixel_share: Measured share of the time of a full-size step that is proportional to the
+            number of pixels.
     """
 
     config: RunConfig
@@ -174,30 +184,31 @@ class Setup:
 
     @cached_property
     def in_force(self) -> RunConfig:
-        """The configuration, including the settings that changed with the length of the run."""
+        """The configuration with the settings that are valid at the present length of the run."""
         return self.config.model_copy(update=dict(self.revised))
 
     @cached_property
     def numbers(self) -> Numbers:
-        """The decided settings."""
+        """The decided settings that training uses."""
         return Numbers.of(self.in_force)
 
     def following(self, steps: int, start: int | None) -> dict[str, Any]:
-        """Return the length-dependent settings for a total of `steps` steps.
+        """Return the settings that depend on the length, for a total of `steps` steps.
 
         Args:
-            steps: Steps of the run.
-            start: Primitives at the start; None before they are counted.
+            steps: Total number of steps of the run.
+            start: Number of primitives at the start; None if the primitives have not been counted
+                yet.
         """
         rows = self.decide(Length(self.config.steps or steps, steps, start))
         return {row.setting: row.value for row in rows if row.setting in FOLLOWING}
 
     def at_length(self, steps: int, start: int | None) -> "Setup":
-        """Return the run with the settings for another length."""
+        """Return the setup of the run with the settings for another length."""
         return replace(self, revised={**self.revised, **self.following(steps, start)})
 
     def with_rules(self, rules: Mapping[str, Rule]) -> "Setup":
-        """Return the run with these rules in place of its own rules."""
+        """Return the setup of the run with `rules` in place of its present rules."""
         if rules == self.selection.rules:
             return self
         others = {n: plugin for n, plugin in self.plugins.items() if not isinstance(plugin, Rule)}
@@ -207,82 +218,82 @@ class Setup:
 
     @property
     def backbone(self) -> Backbone:
-        """The backbone."""
+        """The selected backbone."""
         return self.selection.backbone
 
     @property
     def sampler(self) -> Sampler:
-        """The sampler."""
+        """The selected sampler."""
         return self.selection.sampler
 
     @property
     def operator(self) -> Operator:
-        """The operator."""
+        """The selected operator."""
         return self.selection.operator
 
     @property
     def densifier(self) -> Densifier:
-        """The densifier."""
+        """The selected densifier."""
         return self.selection.densifier
 
     @property
     def rasterizer(self) -> Rasterizer:
-        """The rasterizer."""
+        """The selected rasterizer."""
         return self.selection.rasterizer
 
     @property
     def loss(self) -> Loss:
-        """The photometric loss."""
+        """The selected photometric loss."""
         return self.selection.loss
 
     @property
     def exposure(self) -> Exposure:
-        """The exposure, which models how a camera changes light."""
+        """The selected exposure model, which describes brightness and color changes of a camera."""
         return self.selection.exposure
 
     @property
     def metrics(self) -> tuple[Metric, ...]:
-        """The metrics of held-out views."""
+        """The selected metrics for held-out views."""
         return tuple(self.selection.metrics.values())
 
     @cached_property
     def hook(self) -> pluggy.HookRelay:
-        """The hook caller of this run."""
+        """The hook relay that calls the plugins of this run."""
         return self.manager.hook
 
     @cached_property
     def blocks(self) -> tuple[Block, ...]:
-        """The backbone's blocks."""
+        """The blocks of the backbone's parameters."""
         return self.backbone.blocks()
 
     @cached_property
     def trained_blocks(self) -> tuple[Block, ...]:
-        """The blocks that get gradients."""
+        """The blocks whose tensors receive gradients."""
         return self.backbone.trained_blocks()
 
     @cached_property
     def train_views(self) -> tuple[View, ...]:
-        """The training views, in the order that samplers index."""
+        """The training views. Samplers use positions in this tuple as view indices."""
         return self.scene.train_views
 
     @cached_property
     def row_of(self) -> dict[str, int]:
-        """Name of a training view -> its position."""
+        """Name of a training view -> its position in `train_views`."""
         return {view.name: row for row, view in enumerate(self.train_views)}
 
     @cached_property
     def per_photo(self) -> Mapping[str, PerPhoto]:
-        """The parameters with one value per training photo."""
+        """The exposure parameters with one value for each training photo."""
         return self.exposure.per_photo(self.scene)
 
     @cached_property
     def weighs(self) -> bool:
-        """True if any plugin weighs pixels."""
+        """True if a plugin weights pixels of the loss."""
         return bool(self.hook.crossgrad_pixel_weights.get_hookimpls())
 
     @cached_property
     def watchers(self) -> tuple[str, ...]:
-        """Names of the plugins that read the gradients of single views."""
+        """Names of the plugins that read the separate gradients of the views."""
         wants = "needs_separate_gradients"
         return tuple(name for name, plugin in self.plugins.items() if getattr(plugin, wants, False))
 
@@ -293,19 +304,22 @@ class Setup:
 
     @cached_property
     def operator_scale(self) -> OperatorScale:
-        """The scale of the operator's result for equal gradients."""
+        """The scale of the operator's result for equal gradients of the views."""
         return OperatorScale(self.operator)
 
     @cached_property
     def joint(self) -> bool:
-        """True if one backward pass runs through the sum of the views' losses."""
+        """True if a single backward pass computes the gradient of the summed loss of all views."""
         return self.config.backward == "joint"
 
     @cached_property
     def sparse_rows(self) -> Mapping[str, str]:
-        """Field of the Gaussians -> tensor whose Adam steps are deferred until a row is drawn."""
+        """Field of the Gaussians -> tensor.
+
+        Adam steps of this tensor are deferred until a row is rendered.
+        """
         trained = {name for block in self.trained_blocks for name in block.tensors}
-        # A plugin that reads the model after each step needs every row, and a wrapper of the
+        # A plugin that reads the model after each step needs all rows up to date. A wrapper of the
         # aggregation needs dense gradients.
         whole = self.joint or self.shows_model or self.device.type != "cpu"
         wrapped = len(self.hook.crossgrad_aggregate_gradients.get_hookimpls()) > 1
@@ -316,10 +330,11 @@ class Setup:
 
     @cached_property
     def update_intervals(self) -> Mapping[str, int]:
-        """Trained tensor -> N, for tensors that learn in one of N steps.
+        """Trained tensor -> N, for tensors that are updated in one of N steps.
 
         Raises:
-            UserError: A plugin names another tensor, or N is not a whole number of at least 1.
+            UserError: A plugin names a tensor that is not trained, or N is not a whole number of at
+                least 1.
         """
         hook = self.hook.crossgrad_update_intervals
         trained = {name for block in self.trained_blocks for name in block.tensors}
@@ -334,45 +349,48 @@ class Setup:
         return intervals
 
     def resting(self, step: int) -> frozenset[str]:
-        """Return the names of the tensors that do not learn in a step."""
+        """Return the names of the tensors that are not updated in a step."""
         intervals = self.update_intervals.items()
         return frozenset(name for name, every in intervals if not learns_in(step, every))
 
     @cached_property
     def regularizes(self) -> bool:
-        """True if any plugin adds loss terms."""
+        """True if a plugin adds regularization terms to the loss."""
         return bool(self.hook.crossgrad_regularize.get_hookimpls())
 
     @cached_property
     def shows_model(self) -> bool:
-        """True if any plugin reads the model after a step."""
+        """True if a plugin reads the model after each step."""
         return bool(self.hook.crossgrad_model_ready.get_hookimpls())
 
     @cached_property
     def acts_after_step(self) -> bool:
-        """True if any plugin acts after the step."""
+        """True if a plugin implements the hook `crossgrad_after_step`."""
         return bool(self.hook.crossgrad_after_step.get_hookimpls())
 
     @cached_property
     def follows_steps(self) -> bool:
-        """True if any plugin updates a state after each complete step."""
+        """True if a plugin updates its state after each complete step."""
         return bool(self.hook.crossgrad_step_done.get_hookimpls())
 
     @cached_property
     def changes_rates(self) -> bool:
-        """True if any plugin changes learning rates."""
+        """True if a plugin changes learning rates."""
         return bool(self.hook.crossgrad_rate_factor.get_hookimpls())
 
     @cached_property
     def gaussians_hooks(self) -> tuple[pluggy.HookCaller, ...]:
-        """The hooks of plugins that change the Gaussians of training views, one per plugin."""
+        """The hooks of plugins that change the Gaussians of training views.
+
+        Each plugin has its own hook.
+        """
         return one_by_one(self.manager, "crossgrad_view_gaussians")
 
     @cached_property
     def optimizer_hooks(self) -> tuple[pluggy.HookCaller, ...]:
-        """The hooks of plugins that act after the optimizer, one per plugin."""
+        """The hooks of plugins that act after the optimizer. Each plugin has its own hook."""
         return one_by_one(self.manager, "crossgrad_after_optimizer")
 
     def phase(self, step: int, *, training: bool) -> Phase:
-        """Return the phase in which a backbone decodes."""
+        """Return the phase of training or evaluation in which the backbone decodes."""
         return Phase(step, training, self.schedule)

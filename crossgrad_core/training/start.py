@@ -1,4 +1,4 @@
-"""The first state of a run, and the compilation of its kernels."""
+"""Create the first state of a run, and compile the kernels of the run."""
 
 import json
 import logging
@@ -48,17 +48,18 @@ from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.step import ordered
 from crossgrad_core.wording import in_one_line, listed
 
-#: Seconds to wait for the other process after this process has compiled everything.
+#: Seconds that this process waits for the compiling process, after its own compilations.
 _PATIENCE: Final = 60.0
 
 
 @contextmanager
 def compiling_beside(setup: Setup) -> Iterator[None]:
-    """Compile kernels in a second process, which starts at the first missing kernel.
+    """Compile kernels in a second process, which starts when the first missing kernel is found.
 
-    The second process is not used with a single core or thread, or for a GPU. At the end of the
-    block, this process waits for it. Then all kernels for sparse rows are loaded, because few and
-    many rows use different kernels, and a view of either kind may first occur during training.
+    No second process is used on a GPU, on a single core, or if the run uses only one thread. At the
+    end of the block, this process waits for the second process. After the wait, this process loads
+    all kernels for sparse rows. Steps with few and with many rows use different kernels, and the
+    second kind may first occur during training.
     """
     alone = setup.config.threads == 1 or available_cores() == 1
     processes: list[subprocess.Popen[bytes]] = []
@@ -74,7 +75,8 @@ def compiling_beside(setup: Setup) -> Iterator[None]:
         with notes_on_missing(start):
             yield
         for process in processes:
-            # A hanging process, for example in a plugin's import, must not block the run.
+            # A process that hangs, for example during the import of a plugin, must not block the
+            # run.
             with suppress(subprocess.TimeoutExpired):
                 process.wait(_PATIENCE)
         if setup.sparse_rows:
@@ -86,7 +88,10 @@ def compiling_beside(setup: Setup) -> Iterator[None]:
 
 
 def compile_all(loss: ComponentChoice) -> None:
-    """Compile the kernels of a loss and the optimizer with dummy data."""
+    """Compile the kernels of a loss and of the optimizer.
+
+    To compile the kernels, call the loss and the optimizer with artificial data.
+    """
     photo = torch.zeros((64, 64, 3), dtype=torch.uint8)
     render = torch.full((64, 64, 3), 0.5, requires_grad=True)
     measured = build(Loss, loss.name, loss.options).loss(render, photo, None, None)
@@ -98,10 +103,13 @@ def compile_all(loss: ComponentChoice) -> None:
 
 
 def compile_rows() -> None:
-    """Compile the kernels for optimizer steps of sparse rows with dummy data."""
+    """Compile the optimizer kernels for sparse rows.
+
+    To compile the kernels, call the optimizer with artificial data.
+    """
     values, state, late = torch.zeros((8, 3)), AdamState(), Late()
-    # Train one row, then another row with deferred steps, then enough rows for the kernel that
-    # updates all rows.
+    # The three steps call all kernels: one row, another row with deferred steps, and enough rows
+    # for the kernel that updates all rows.
     for rows in ([1], [4], [1, 4, 6]):
         grad = sparse_rows(torch.tensor(rows), torch.ones((len(rows), 3)), values.shape)
         late.step(
@@ -117,11 +125,12 @@ if __name__ == "__main__":
 _LOG = logging.getLogger(__name__)
 #: Number of random initial points (`--init random`).
 RANDOM_POINTS = 20_000
-#: Maximum share of --max-gaussians with which a run starts if its points would give more Gaussians
-#: (docs/schedules.md). `THINNED` is the name of the state that stores the number without this
-#: limit.
+#: If the points would give more Gaussians than --max-gaussians, a run starts with this share of the
+#: limit (docs/schedules.md). `THINNED` is the key of the state that stores how many Gaussians all
+#: points would give.
 BEGINNING, THINNED = 2 / 3, "thinned"
-#: The next attempt keeps at most this share of the points.
+#: If a reduced set of points still gives too many Gaussians, the next attempt uses at most this
+#: share of the set.
 _LESS = 0.8
 
 
@@ -133,8 +142,8 @@ def first_state(setup: Setup) -> TrainState:
     parameters = ordered(parameters, setup.blocks, setup.backbone.positions)
     trained = {name for block in setup.trained_blocks for name in block.tensors}
     parameters = {
-        # Make the tensors contiguous, as they are after loading a checkpoint, because another
-        # memory layout changes the rounding.
+        # Make the tensors contiguous, because they are contiguous after a checkpoint is loaded.
+        # Another memory layout would change the rounding.
         name: tensor.detach().to(setup.device).contiguous().requires_grad_(name in trained)
         for name, tensor in parameters.items()
     }
@@ -151,16 +160,17 @@ def first_state(setup: Setup) -> TrainState:
 
 
 def initial_parameters(setup: Setup, rng: np.random.Generator) -> tuple[Parameters, int | None]:
-    """Return parameters made from SfM points, from random points, or from a PLY of Gaussians.
+    """Return parameters made from SfM points, from random points, or from a PLY file of Gaussians.
 
-    If the points would make more primitives than the user's bound, points are drawn at random, so
-    that the run starts with the share `BEGINNING` of the bound. The remaining share is left for
-    density control, which places primitives where the photos need them. Without density control,
-    the run starts with the full bound. A PLY is used unchanged.
+    If the points would give more primitives than the user's limit, a random subset of the points is
+    used. With such a subset, the run starts with the share `BEGINNING` of the limit. Density
+    control can add the remaining primitives in regions that need more primitives. Without density
+    control, the run starts with as many primitives as the limit allows. The Gaussians of a PLY file
+    are used unchanged.
 
     Returns:
-        The parameters, and the number of primitives that all points would have made; None if all
-        points were used.
+        The parameters, and the number of primitives that all points would give. The number is None
+        if all points were used.
     """
     data, scene = setup.config.data, setup.scene
     if data.init_file is not None:
@@ -178,23 +188,25 @@ def initial_parameters(setup: Setup, rng: np.random.Generator) -> tuple[Paramete
     while made > bound and share * len(begun.points) >= 1.0:
         parameters = _made(setup, setup.backbone.create(thinned(begun, share, rng), rng), "create")
         made = primitives_of(setup.blocks, parameters)
-        # If the number of Gaussians per point is not 1, several attempts are needed.
+        # Several attempts are needed if the backbone does not make exactly one Gaussian from each
+        # point.
         share *= min(_LESS, wanted / made)
     return parameters, present
 
 
 def _begun(setup: Setup) -> Scene:
-    """Return the scene with the points that the initializer adds.
+    """Return the scene, including the points that the initializer adds.
 
     Raises:
-        UserError: The points are not valid.
+        UserError: The initializer returned invalid points.
     """
     scene, initializer = setup.scene, setup.selection.initializer
     try:
         begun = initializer.begun(scene)
         wrong = _misfit(begun, len(scene.points))
     except ValueError as error:
-        initializer.more_points(scene)  # This call raises the errors of the initializer itself.
+        # If the initializer itself fails, this call raises its original error.
+        initializer.more_points(scene)
         wrong = in_one_line(error)
     if not wrong:
         return begun
@@ -209,7 +221,7 @@ def _begun(setup: Setup) -> Scene:
 
 
 def _misfit(begun: Scene, known_count: int) -> str:
-    """Return the problem of the points after the first `known_count`; empty if all are valid."""
+    """Return a description of the problem of the added points; empty if all points are valid."""
     points, sizes, opacities = begun.points[known_count:], begun.point_sizes, begun.point_opacities
     if sizes is None or opacities is None:
         return ""
@@ -220,7 +232,7 @@ def _misfit(begun: Scene, known_count: int) -> str:
     if not np.isfinite(points).all():
         return "a position that is not finite"
     sizes, opacities = sizes[known_count:], opacities[known_count:]
-    # NaN means that the backbone chooses the size or the opacity.
+    # NaN means that the backbone chooses the size or the opacity of the Gaussian.
     if not (((sizes > 0.0) & np.isfinite(sizes)) | np.isnan(sizes)).all():
         return "a size that is not a number above 0"
     inside = (opacities > 0.0) & (opacities < 1.0) | np.isnan(opacities)
@@ -228,11 +240,11 @@ def _misfit(begun: Scene, known_count: int) -> str:
 
 
 def _made(setup: Setup, answer: object, method: str) -> Parameters:
-    """Return the checked parameters from a method of the backbone.
+    """Check and return the parameters that a method of the backbone returned.
 
     Raises:
-        UserError: The result is not a dictionary, or it lacks tensors that the blocks name (after
-            `prepare`: any of them; before: the first per-primitive tensor).
+        UserError: The result is not a dictionary, or tensors are missing. After `prepare`, all
+            tensors of the blocks are required; before, only the first per-primitive tensor.
     """
     parameters = answered(answer, dict, setup.backbone, method)
     per_primitive = [block.tensors for block in setup.blocks if block.per_primitive]
@@ -252,10 +264,12 @@ def _made(setup: Setup, answer: object, method: str) -> Parameters:
 
 
 def thinned(scene: Scene, share: float, rng: np.random.Generator) -> Scene:
-    """Return the scene with this share of its points, at least one, drawn at random.
+    """Return the scene with a given share of its points, drawn at random.
 
-    Points with sizes come from an initializer. All of these points are kept if they fit, because
-    each of them covers a region without other points.
+    At least one point remains.
+
+    Points that have sizes were added by an initializer. All points of the initializer are kept if
+    they fit, because each point covers a region without other points.
     """
     count = len(scene.points)
     wanted = max(1, round(share * count))
@@ -269,7 +283,10 @@ def thinned(scene: Scene, share: float, rng: np.random.Generator) -> Scene:
 
 
 def start_notes(setup: Setup, state: TrainState) -> tuple[str, ...]:
-    """Return notes on a start with fewer primitives than possible, or with more than the bound."""
+    """Return a note if the run does not start with all primitives that its points would give.
+
+    If a PLY file contains more Gaussians than the limit allows, a note is returned, too.
+    """
     kept, most = state.states.get(THINNED), setup.config.max_gaussians
     if kept is None:
         present = state.primitives(setup)
@@ -292,7 +309,7 @@ def start_notes(setup: Setup, state: TrainState) -> tuple[str, ...]:
 
 
 def with_random_points(scene: Scene, rng: np.random.Generator) -> Scene:
-    """Return the scene with random grey points, uniform in a cube of side 3 (local units)."""
+    """Return the scene with random grey points, uniform in a cube of side 3 in local units."""
     points = rng.uniform(-1.5, 1.5, (RANDOM_POINTS, 3))
     colors = np.full((RANDOM_POINTS, 3), 127, dtype=np.uint8)
     views = tuple(replace(view, seen=np.zeros(0, dtype=np.int64)) for view in scene.views)
@@ -300,40 +317,39 @@ def with_random_points(scene: Scene, rng: np.random.Generator) -> Scene:
 
 
 def unwatched(setup: Setup) -> Setup:
-    """Return the run without observers and wrappers, which must not see uncounted steps."""
+    """Return the setup without observers and wrappers, which must not receive uncounted steps."""
     plugins = setup.selection.plugins
     return replace(setup, manager=make_manager(plugins), plugins=plugins)
 
 
 def warm_up(setup: Setup, reached: TrainState | None = None) -> float:
-    """Compile every kernel that the run needs, with temporary states.
+    """Compile all kernels that the run needs, by taking steps with temporary states.
 
-    Photos are decoded at the same time, because compilers run one at a time and release the
-    interpreter lock.
+    Photos are decoded in parallel. Parallel decoding saves time, because compilers run one at a
+    time and release the interpreter lock.
 
     Args:
-        setup: The run.
-        reached: The state of a resumed run, which is not changed.
+        setup: Setup of the run.
+        reached: The training state of a resumed run; this state does not change.
 
     Returns:
-        The time in seconds.
+        The time that the compilation took, in seconds.
 
     Raises:
-        UserError: The rasterizer renders incorrectly on this machine.
+        UserError: The rasterizer fails its self-test on this machine.
     """
     _LOG.info("loading kernels")
     start = perf_counter()
     setup.rasterizer.self_test(str(setup.device))
     setup, schedule = unwatched(setup), setup.schedule
-    # A run of one step cannot test a second step.
+    # Use step 0 if the run has only one step.
     degrees = {max(schedule.sh_interval * degree, schedule.sh_wait) for degree in (1, 2, 3)}
     steps = [min(1, schedule.total - 1), *map(schedule.step_of, sorted(degrees))]
     if setup.densifier.needs:
-        # Statistics are no longer collected after the end of density control, so training then uses
-        # other kernels.
+        # After the end of density control, training collects no statistics and uses other kernels.
         steps.append(schedule.step_of(schedule.densify_until))
     if schedule.grows:
-        # An edit may render, too.
+        # An edit may also render views.
         steps.append(schedule.first_edit - 1)
     with decoded_meanwhile(setup.scene), compiling_beside(setup):
         for step in steps:
@@ -342,7 +358,8 @@ def warm_up(setup: Setup, reached: TrainState | None = None) -> float:
                 state.step = step
                 timed_step(setup, state)
                 if setup.sparse_rows and step == steps[0] and step + 1 < schedule.total:
-                    # From the second step on, some rows have deferred updates.
+                    # In the second step, some rows have deferred updates, which need another
+                    # kernel.
                     timed_step(setup, state)
     seconds = perf_counter() - start
     _LOG.debug("loaded kernels in %.1f s", seconds)
@@ -350,6 +367,6 @@ def warm_up(setup: Setup, reached: TrainState | None = None) -> float:
 
 
 def initial_bytes(setup: Setup) -> int:
-    """Return the bytes of the initial parameters with their gradients and moments."""
+    """Return the bytes of the initial parameters, their gradients and their moments."""
     parameters, _ = initial_parameters(setup, make_streams(setup.config.seed)["create"])
     return 4 * sum(tensor.numel() * tensor.element_size() for tensor in parameters.values())

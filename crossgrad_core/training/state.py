@@ -1,4 +1,4 @@
-"""The state of the training loop: everything that changes and that a checkpoint contains."""
+"""The state of the training loop: all values that training changes and a checkpoint contains."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -28,7 +28,7 @@ from crossgrad_core.training.rngs import make_streams, restored_streams, stream_
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.wording import listed
 
-#: Clock of a time budget: it measures wall-clock seconds or CPU seconds of the process.
+#: Clock of a time budget: wall-clock seconds, or CPU seconds of the process.
 ClockKind = Literal["wall", "cpu"]
 Phase = Literal[
     "photos",
@@ -41,25 +41,26 @@ Phase = Literal[
     "density_control",
     "other",
 ]
-#: Phases of a step. `photos` includes the choice of views and scales and the access to photos.
-#: Decoding of files belongs to loading. `loss` includes exposure, pixel weights and regularisation.
+#: Phases of a step. `photos` is the time to choose views and scales and to read photos from the
+#: cache. The time to decode photo files counts as loading, not as a phase. `loss` includes the
+#: exposure model, pixel weights and regularization.
 PHASES: Final[tuple[Phase, ...]] = get_args(Phase)
 
 
 @dataclass
 class Clock:
-    """Seconds by activity; only `train` counts as training.
+    """Seconds of each activity of the run. Only the seconds in `train` count as training.
 
     Attributes:
-        train: Training.
-        compile: Compiling kernels.
-        load: Reading the scene and decoding photos.
-        evaluate: Evaluating held-out views.
-        report: Writing results.
-        phases: Training seconds by phase of the step; their sum is `train`. Work on a GPU or on
-            other threads is counted in the phase that waits for it.
-        cpu: CPU seconds of the process during training, for all threads. Work of other threads
-            between two steps is included only if the run has a budget in CPU seconds.
+        train: Seconds of training.
+        compile: Seconds of compiling kernels.
+        load: Seconds of reading the scene and decoding photos.
+        evaluate: Seconds of evaluating held-out views.
+        report: Seconds of writing results.
+        phases: Training seconds in each phase of a step; their sum is `train`. Work on a GPU or in
+            other threads is counted in the phase that waits for its end.
+        cpu: CPU seconds of the process during training, summed over all threads. The work of other
+            threads between two steps is included only if the time budget counts CPU seconds.
     """
 
     train: float = 0.0
@@ -71,7 +72,7 @@ class Clock:
     cpu: float = 0.0
 
     def trained(self, kind: ClockKind) -> float:
-        """Return the training seconds on this clock."""
+        """Return the training seconds, in wall-clock time or CPU time."""
         return self.cpu if kind == "cpu" else self.train
 
     def copy(self) -> "Clock":
@@ -79,7 +80,7 @@ class Clock:
         return replace(self, phases=dict(self.phases))
 
     def count(self, laps: "PhaseTimer") -> None:
-        """Add the times of a complete step."""
+        """Add the times of a step after the step is complete."""
         self.train += laps.total
         self.cpu += laps.cpu
         for phase in PHASES:
@@ -88,15 +89,16 @@ class Clock:
 
 @dataclass
 class PhaseTimer:
-    """The phases of the current step; an interrupted step is not counted.
+    """A timer for the phases of the present step. An interrupted step is not counted.
 
     Attributes:
-        phase_began: Time at which the present phase began.
-        total: Seconds from the start of the step to the end of the previous phase, without excluded
+        phase_began: Time at which the present phase began, later by the excluded seconds.
+        total: Seconds from the start of the step to the end of the previous phase. Excluded seconds
+            are not counted.
+        spent: Seconds of each phase so far.
+        cpu: CPU seconds of the process during `total`. Excluded CPU seconds are not counted.
+        cpu_border: CPU time of the process when the present phase began, later by the excluded CPU
             seconds.
-        spent: Phase -> seconds.
-        cpu: CPU seconds of the process during `total`, without excluded CPU seconds.
-        cpu_border: CPU time of the process at the end of the previous phase.
     """
 
     phase_began: float = field(default_factory=perf_counter)
@@ -106,7 +108,7 @@ class PhaseTimer:
     cpu_border: float = field(default_factory=process_time)
 
     def lap(self, phase: Phase) -> None:
-        """End a phase: add the time since the end of the previous phase to its total."""
+        """End a phase: add the time since the previous phase ended to the seconds of this phase."""
         now = perf_counter()
         seconds = now - self.phase_began
         self.spent[phase] = self.spent.get(phase, 0.0) + seconds
@@ -117,11 +119,11 @@ class PhaseTimer:
         self.cpu_border = cpu
 
     def leave_out(self, seconds: float, cpu: float) -> None:
-        """Exclude seconds from the present phase, because these seconds belong to another clock.
+        """Exclude seconds from the present phase, because another activity of `Clock` counts them.
 
         Args:
             seconds: Wall-clock seconds.
-            cpu: CPU seconds in this time.
+            cpu: CPU seconds during this wall-clock time.
         """
         self.phase_began += seconds
         self.cpu_border += cpu
@@ -129,13 +131,14 @@ class PhaseTimer:
 
 @dataclass
 class Counters:
-    """Counts of the work done so far.
+    """Counts of the work so far.
 
     Attributes:
-        views: Rendered training views.
-        backward_passes: Backward passes.
-        dropped: Blocks of views that were dropped because their gradient was not finite.
-        peak_primitives: Largest number of primitives after any step.
+        views: Number of rendered training views.
+        backward_passes: Number of backward passes.
+        dropped: Number of gradients (of one block and one view) that were dropped because they were
+            not finite.
+        peak_primitives: Largest number of primitives after a step.
     """
 
     views: int = 0
@@ -146,23 +149,23 @@ class Counters:
 
 @dataclass
 class TrainState:
-    """All values that a step reads and writes.
+    """All values that a training step reads and changes.
 
     Attributes:
-        tensors: The parameters as stored in memory. Some rows may have deferred Adam steps, and a
-            step may still run on other threads.
-        moments: The optimizer's moments as stored in memory. Deferred and running steps may change
-            them, too.
-        rngs: Stream name -> generator of the stream.
-        states: Plugin name -> its state.
-        step: Number of steps, including the present one.
-        last: Record of the last complete step.
+        tensors: The parameters in memory. Some rows may have deferred Adam steps, and other threads
+            may still be changing rows.
+        moments: The optimizer's moments in memory. Deferred steps and running steps also change the
+            moments.
+        rngs: Name of a random stream -> its generator.
+        states: Name of a plugin -> its state.
+        step: Number of steps, including the present step.
+        last: Record of the last complete step; None before the first step.
         counters: Counts of the work so far.
-        clock: Seconds so far.
-        laps: Phases of the present step.
-        rewinds: How often training was rewound to the last good state.
-        touched: True if an incomplete step has begun to change parameters or moments.
-        late: The deferred steps of rows, and the steps that still run on other threads.
+        clock: Seconds of each activity so far.
+        laps: Timer for the phases of the present step.
+        rewinds: Number of rollbacks to the last good state.
+        touched: True if a step has begun to change parameters or moments, but is not complete.
+        late: The deferred steps of rows, and the steps that still run in other threads.
     """
 
     tensors: Parameters
@@ -180,7 +183,7 @@ class TrainState:
 
     @property
     def parameters(self) -> Parameters:
-        """Tensor name -> parameter, after all deferred steps."""
+        """Tensor name -> parameter. All deferred steps are applied first."""
         self.settle()
         return self.tensors
 
@@ -191,7 +194,7 @@ class TrainState:
 
     @property
     def adam(self) -> AdamState:
-        """The optimizer's moments, after all deferred steps."""
+        """The optimizer's moments. All deferred steps are applied first."""
         self.settle()
         return self.moments
 
@@ -202,31 +205,35 @@ class TrainState:
 
     @property
     def current(self) -> Mapping[str, Tensor]:
-        """The parameters; deferred steps of a tensor are applied when it is read."""
+        """The parameters by name.
+
+        The deferred steps of a tensor are applied when the tensor is read.
+        """
         return _Current(self)
 
     def settle(self, names: Iterable[str] | None = None) -> None:
-        """Apply the deferred steps of these tensors, by default of all tensors."""
+        """Apply the deferred steps of the named tensors; by default, of all tensors."""
         for name in self.late.names.intersection(self.late.names if names is None else names):
             self.late.catch_up(name, self.tensors[name], self.moments)
 
     def primitives(self, setup: Setup) -> int:
-        """Return the number of primitives."""
+        """Return the present number of primitives."""
         return primitives_of(setup.blocks, self.tensors)
 
     def commit(self, states: Mapping[str, PluginState]) -> None:
-        """Store states of the core."""
+        """Store states that the core itself created, without checks."""
         self.states.update(states)
 
     def accept(self, states: Mapping[str, PluginState], hook: HookCaller) -> None:
         """Check and store the states that plugins returned from a hook.
 
         Args:
-            states: Name -> state.
-            hook: The hook; a component that implements it may use the name of its slot.
+            states: State of each plugin, by the name of the plugin.
+            hook: The hook. A component that implements the hook may use the name of its slot as the
+                name of its state.
 
         Raises:
-            UserError: A name belongs to a slot or to the core, or a state is not valid.
+            UserError: A name is reserved for a slot or for the core, or a state is not valid.
         """
         if not isinstance(states, Mapping):
             raise _no_states(hook, "its states", "a mapping of names to PluginState", states)
@@ -257,9 +264,11 @@ class TrainState:
 
 
 def unsavable(new: PluginState, device: str, known: PluginState = EMPTY_STATE) -> str:
-    """Return the part of a state that a checkpoint cannot store; empty if there is none.
+    """Return why a checkpoint cannot store a state.
 
-    For speed in each step, only names that are not in the state `known` are checked.
+    The text is empty if a checkpoint can store the state.
+
+    To keep steps fast, only names that the state `known` does not contain are checked.
     """
     for kind in ("values", "tensors", "per_primitive"):
         have = getattr(known, kind)
@@ -273,7 +282,10 @@ def unsavable(new: PluginState, device: str, known: PluginState = EMPTY_STATE) -
 
 
 def no_json(value: object) -> str:
-    """Return the part of a value that JSON cannot store unchanged; empty if there is none."""
+    """Return the part of a value that JSON cannot store unchanged.
+
+    The text is empty if JSON can store the value.
+    """
     if isinstance(value, dict):
         odd = (f"the key {key!r}" for key in value if not isinstance(key, str))
         return next(odd, "") or no_json(list(value.values()))
@@ -284,7 +296,10 @@ def no_json(value: object) -> str:
 
 
 def _odd(value: object, device: str) -> str:
-    """Return how a value differs from a tensor that a file can store; empty if it can be stored."""
+    """Return why a value cannot be stored as a tensor in a file.
+
+    The text is empty if the value can be stored.
+    """
     if not isinstance(value, Tensor):
         return f"of type {type(value).__name__}, not a tensor"
     plain = value.layout == torch.strided and not value.dtype.is_complex and not value.is_quantized
@@ -308,7 +323,11 @@ def _no_states(hook: HookCaller, what: str, expected: str, found: object) -> Use
 
 
 class _Current(Mapping[str, Tensor]):
-    """Tensor name -> parameter; reading applies deferred Adam steps. A copy is a plain dict."""
+    """A mapping from the names of tensors to parameters.
+
+    Reading a parameter applies its deferred Adam steps first. A copy of this mapping is a plain
+    dict.
+    """
 
     def __init__(self, state: TrainState) -> None:
         self._state = state
@@ -333,9 +352,9 @@ class _Current(Mapping[str, Tensor]):
 
 @dataclass(frozen=True, eq=False)
 class StepSnapshot:
-    """All values that a step changes except parameters and moments, at one time.
+    """A snapshot of all values that a step changes, except parameters and moments.
 
-    Plugin states and records are immutable values and need no copy.
+    Plugin states and records are immutable, so they are not copied.
     """
 
     step: int
@@ -348,7 +367,7 @@ class StepSnapshot:
 
     @classmethod
     def of(cls, state: TrainState) -> "StepSnapshot":
-        """Return a snapshot of the present moment."""
+        """Return a snapshot of the present values."""
         return cls(
             step=state.step,
             last=state.last,
@@ -360,7 +379,7 @@ class StepSnapshot:
         )
 
     def restore(self, state: TrainState) -> None:
-        """Restore everything, including the positions of the random streams."""
+        """Restore all values of the snapshot, including the positions of the random streams."""
         state.step = self.step
         state.last = self.last
         state.states = dict(self.states)
@@ -372,7 +391,7 @@ class StepSnapshot:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """A copy of the last good state, for a rollback."""
+    """A copy of the last state that was finite, for a rollback."""
 
     parameters: Parameters
     adam: AdamState
@@ -380,7 +399,7 @@ class Snapshot:
 
     @classmethod
     def of(cls, state: TrainState) -> "Snapshot":
-        """Return a deep copy of everything that training changes."""
+        """Return a deep copy of all values that training changes."""
         return cls(
             parameters={name: t.detach().clone() for name, t in state.parameters.items()},
             adam=copied_moments(state.adam),
@@ -388,7 +407,10 @@ class Snapshot:
         )
 
     def restore(self, state: TrainState, seed: int) -> None:
-        """Restore `state` with new random streams, so that the same draws do not occur again."""
+        """Restore `state`, but with new random streams.
+
+        After the rollback, training makes other draws than before.
+        """
         state.late.forget()
         state.tensors = self._tensors(state, {n: t.clone() for n, t in self.parameters.items()})
         state.moments = copied_moments(self.adam)
@@ -401,8 +423,8 @@ class Snapshot:
     def hand_over(self, state: TrainState) -> None:
         """Restore `state` exactly, including the random streams.
 
-        `state` gets the tensors of the copy itself, because memory may be short. The copy cannot be
-        used again.
+        `state` receives the tensors of the snapshot themselves, because a copy may not fit into
+        memory. The snapshot cannot be used again.
         """
         state.late.forget()
         state.tensors = self._tensors(state, self.parameters)
@@ -411,13 +433,13 @@ class Snapshot:
 
     @staticmethod
     def _tensors(state: TrainState, copies: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the copies with the same `requires_grad` as the tensors of the state."""
+        """Return the copies; each gets the `requires_grad` of its tensor in the training state."""
         learns = {name: tensor.requires_grad for name, tensor in state.tensors.items()}
         return {name: copied.requires_grad_(learns[name]) for name, copied in copies.items()}
 
 
 def copied_moments(adam: AdamState) -> AdamState:
-    """Return a deep copy."""
+    """Return a deep copy of the optimizer's moments."""
     return AdamState(
         exp_avg={name: tensor.clone() for name, tensor in adam.exp_avg.items()},
         exp_avg_sq={name: tensor.clone() for name, tensor in adam.exp_avg_sq.items()},
@@ -429,9 +451,9 @@ class NonFiniteError(Exception):
     """A loss, gradient or parameter is NaN or infinite.
 
     Args:
-        step: Step in which the value was found.
-        views: Names of the views of that step, or of the single view if it is known.
-        block: Description of the value that is not finite.
+        step: The step in which the value was found.
+        views: Names of the views in this step, or only of the view that caused the value.
+        block: Description of the value, for the message.
     """
 
     def __init__(self, step: int, views: tuple[str, ...], block: str) -> None:
@@ -445,7 +467,7 @@ class NonFiniteError(Exception):
 
 
 class TrainingFailedError(Exception):
-    """Training cannot continue; the results so far and the last checkpoint are kept."""
+    """Training cannot continue. The results so far and the last checkpoint remain."""
 
 
 def are_parameters_finite(state: TrainState) -> bool:
@@ -455,7 +477,7 @@ def are_parameters_finite(state: TrainState) -> bool:
 
 
 def check_parameters(state: TrainState) -> None:
-    """Raise NonFiniteError if a parameter is NaN or infinite after a step."""
+    """Raise NonFiniteError if a parameter is NaN or infinite."""
     state.late.finish()
     for name, tensor in state.tensors.items():
         if not is_finite(tensor):
@@ -464,10 +486,11 @@ def check_parameters(state: TrainState) -> None:
 
 
 def check_start(state: TrainState) -> None:
-    """Check the state at the start of training, before which there is no state to restore.
+    """Check the state at the start of training, when no earlier state could be restored.
 
     Raises:
-        TrainingFailedError: A parameter or moment is NaN or infinite; the message names it.
+        TrainingFailedError: A parameter or moment is NaN or infinite. The message names the
+            parameter.
     """
     parts = {
         "block": state.parameters,
@@ -492,7 +515,7 @@ def _way_out(step: int) -> str:
 
 
 def check_dropped(setup: Setup, state: TrainState, record: StepRecord) -> None:
-    """Raise TrainingFailedError if too many non-finite gradients were dropped."""
+    """Raise TrainingFailedError if too many non-finite gradients were dropped so far."""
     if state.counters.dropped >= setup.config.max_nonfinite_blocks:
         raise TrainingFailedError(
             f"{state.counters.dropped} blocks of single views were dropped because their gradient "
@@ -501,14 +524,15 @@ def check_dropped(setup: Setup, state: TrainState, record: StepRecord) -> None:
 
 
 class RollbackGuard:
-    """The state before the present step, and a copy of an earlier good state.
+    """Protection against errors: values before the present step, and a copy of an earlier state.
 
-    Most errors of a step (sampling, a photo, rendering, an operator, the memory) occur before
-    parameters change. Then only the present step is lost. If an optimizer step or an edit was
-    interrupted, the copy is restored. Only checked states are copied.
+    Most errors of a step occur before parameters change, for example in sampling, photo decoding or
+    rendering. After an error of this kind, only the present step is lost. If an error interrupts
+    the optimizer or an edit, the copy of the earlier state is restored. Only states that are finite
+    are copied.
 
     Args:
-        state: The state at the start of training, already checked.
+        state: The training state at the start, which must already be checked.
     """
 
     def __init__(self, state: TrainState) -> None:
@@ -518,7 +542,7 @@ class RollbackGuard:
         state.touched = False
 
     def commit(self, state: TrainState, *, look: bool = False) -> None:
-        """Record that a step is complete.
+        """Record that a step is complete. An error in the next step does not undo a complete step.
 
         Raises:
             NonFiniteError: `look` is True, and a parameter is NaN or infinite.
@@ -529,7 +553,7 @@ class RollbackGuard:
         state.touched = False
 
     def check(self, state: TrainState) -> None:
-        """Check the parameters, unless they were already checked after this step.
+        """Check the parameters, unless a check after this step has already been done.
 
         Raises:
             NonFiniteError: A parameter is NaN or infinite.
@@ -539,7 +563,7 @@ class RollbackGuard:
             self._looked = state.step
 
     def copy(self, state: TrainState) -> None:
-        """Copy this state as the state to restore after an error.
+        """Copy this state. The copy can be restored after an error.
 
         Raises:
             NonFiniteError: A parameter is NaN or infinite.
@@ -548,15 +572,17 @@ class RollbackGuard:
         self._snapshot = Snapshot.of(state)
 
     def rewind(self, state: TrainState, seed: int) -> None:
-        """Restore `state` from the copy, with new random streams."""
+        """Restore `state` from the copy, but with new random streams."""
         self._snapshot.restore(state, seed)
         self._looked = state.step
         self.commit(state)
 
     def restore(self, state: TrainState) -> None:
-        """Restore `state` to the last complete step or, if this is impossible, to the copy.
+        """Restore `state` to the end of the last complete step.
 
-        This method is for the end of training, because the copy cannot be used again.
+        If the snapshot cannot be restored, restore the copy.
+
+        Call this method only at the end of training, because the copy cannot be used again.
         """
         for tensor in state.tensors.values():
             tensor.grad = None
@@ -568,10 +594,12 @@ class RollbackGuard:
 
 
 def is_whole(state: TrainState) -> bool:
-    """Return True if all parameters are finite; False if they are not or cannot be checked."""
+    """Return True if all parameters are finite.
+
+    Return False if a parameter is not finite or the check fails.
+    """
     try:
         return are_parameters_finite(state)
     except Exception:
-        # This fails if the last step failed, if the check needs more memory than available, or if
-        # the GPU failed.
+        # The check itself fails if the last step failed, if memory is short, or if the GPU failed.
         return False

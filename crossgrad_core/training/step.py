@@ -1,4 +1,4 @@
-"""One optimizer step: sample, render, aggregate, optimize, densify."""
+"""One training step: sample views, render, aggregate gradients, optimize, densify."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -70,7 +70,7 @@ from crossgrad_core.wording import listed
 
 
 def model_of(setup: Setup, state: TrainState) -> Model:
-    """Return the model after the last step; it shares its tensors with `state`."""
+    """Return the model after the last step. The model and `state` share their tensors."""
     return Model(
         phase=setup.phase(state.step, training=True),
         scene=setup.scene,
@@ -87,15 +87,16 @@ def model_of(setup: Setup, state: TrainState) -> Model:
     )
 
 
-#: Name of the state that contains the labels, and name of their stream of random numbers.
+#: `GROUPING`: key of the state that contains the labels, and name of the grouping's random stream.
+#: `_LABELS`: key of the labels in this state.
 GROUPING = "grouping"
 _LABELS = "labels"
 
 
 def regroup_if_due(setup: Setup, state: TrainState) -> None:
-    """Group the training views again if the last completed step is `refit_after`.
+    """Group the training views again if the last completed step is the grouping's `refit_after`.
 
-    The state of the sampler is reset, because it refers to the old groups.
+    The state of the sampler is reset, because this state refers to the old groups of views.
     """
     grouping = setup.selection.grouping
     if not isinstance(grouping, Regrouping) or state.step != grouping.refit_after:
@@ -108,7 +109,7 @@ def regroup_if_due(setup: Setup, state: TrainState) -> None:
 
 
 def labels_of(rule: GroupingRule, scene: Scene, name: str) -> tuple[str, ...]:
-    """Return one label for each training view, by the rule of the grouping `name`."""
+    """Return one label for each training view, computed by the rule of the grouping `name`."""
     labels, views = tuple(rule.labels(scene.train_views)), scene.train_views
     if len(labels) == len(views):
         return labels
@@ -125,26 +126,29 @@ def groups_of(setup: Setup, state: TrainState) -> tuple[str, ...] | None:
     return tuple(map(str, labels)) if isinstance(labels, list) else setup.groups
 
 
-#: Name of the stream for all random numbers of extra views.
+#: Name of the random stream for all random numbers of extra views.
 STREAM = "density"
 
 
 def observed_views(
     setup: Setup, state: TrainState, records: Sequence[ViewRecord]
 ) -> tuple[ViewRecord, ...]:
-    """Return the views that density control receives, with an extra view if it is due.
+    """Return the records of views for density control.
+
+    The records include an extra view in the steps that require one.
 
     Raises:
         NonFiniteError: The loss of the extra view is not finite.
     """
     if setup.config.densify_views == "one":
-        # In each step, use the view at another position of the sample, because a sampler may always
-        # put the same group first.
+        # In each step, use another position of the sample. A sampler may always put one group of
+        # views first.
         return (records[state.step % len(records)],)
     wanted = setup.schedule.grows and setup.schedule.collects(state.step)
     if setup.config.densify_views != "extra" or not wanted:
         return tuple(records)
-    # All random numbers of the extra view, its background and plugins come from this stream.
+    # All random numbers for the extra view come from this stream, also for its background and
+    # plugins.
     streams, states = dict.fromkeys(state.rngs, state.rngs[STREAM]), dict(state.states)
     state = replace(state, rngs=streams, states=states)
     index = int(state.rngs[STREAM].integers(len(setup.train_views)))
@@ -153,15 +157,15 @@ def observed_views(
     return (*records, observe_view(setup, state, draw, scales_of(setup, state, draw)[0]))
 
 
-#: Minimum number of Gaussians that are sorted. With 59 parameters per Gaussian, the parameters and
-#: moments use 12 MB.
+#: With fewer Gaussians than this number, sorting in memory does not help. For 2^14 Gaussians with
+#: 59 parameters each, the parameters and moments use 12 MB.
 FEWEST_SORTED = 2**14
-#: Number of bits of a coordinate in a code of 63 bits, and number of cells per unit of the local
-#: frame. The cameras span about one unit. Positions farther away than 128 units are clamped to the
-#: border cells.
+#: `_BITS`: bits of each coordinate in a Morton code of 63 bits. `_CELLS`: number of cells per unit
+#: of the local frame. All cameras together span about one unit. Positions more than 128 units from
+#: the origin are clamped to the outermost cells.
 _BITS = 21
 _CELLS = 2**13
-#: Shifts and masks that insert two zeros between the bits of a number (Morton interleaving).
+#: Shifts and masks that insert two zero bits after each bit of a number (Morton interleaving).
 _SPREAD = (
     (32, 0x001F00000000FFFF),
     (16, 0x001F0000FF0000FF),
@@ -172,7 +176,10 @@ _SPREAD = (
 
 
 def along_curve(positions: Tensor) -> Tensor:
-    """Return [N] int64, the rows of `positions` [N, 3] (local frame) in Morton order; stable."""
+    """Return [N] int64, the rows of `positions` [N, 3] (local frame) in Morton order.
+
+    Rows with equal codes keep their order.
+    """
     highest = 2**_BITS - 1
     cells = torch.nan_to_num(positions.detach().double() * _CELLS + 2 ** (_BITS - 1), nan=0.0)
     codes = cells.clamp(0, highest).long()
@@ -182,12 +189,15 @@ def along_curve(positions: Tensor) -> Tensor:
 
 
 def in_order(parameters: Parameters, blocks: tuple[Block, ...], name: str) -> Tensor | None:
-    """Return [N] int64, the rows of the primitives in Morton order; None to keep the order.
+    """Return [N] int64, the rows of the primitives in Morton order.
+
+    Return None if the order should not change.
 
     Args:
-        parameters: The parameters, in any order.
+        parameters: The parameters in their present order.
         blocks: The blocks of the backbone.
-        name: The tensor of the positions; without it, the order does not change.
+        name: Name of the tensor of positions. If no block contains this tensor, the order does not
+            change.
     """
     if not any(block.per_primitive and name in block.tensors for block in blocks):
         return None
@@ -195,7 +205,7 @@ def in_order(parameters: Parameters, blocks: tuple[Block, ...], name: str) -> Te
 
 
 def ordered(parameters: Parameters, blocks: tuple[Block, ...], name: str) -> Parameters:
-    """Return the parameters with their primitives in Morton order (see `in_order`)."""
+    """Return the parameters with the primitives in Morton order (see `in_order`)."""
     rows = in_order(parameters, blocks, name)
     return (
         parameters if rows is None else apply_to_parameters(Edit(source=rows), blocks, parameters)
@@ -203,13 +213,13 @@ def ordered(parameters: Parameters, blocks: tuple[Block, ...], name: str) -> Par
 
 
 def apply_edit(setup: Setup, state: TrainState, edit: Edit) -> bool:
-    """Apply an edit to parameters, moments and plugin states together.
+    """Apply an edit to the parameters, their moments and the plugin states.
 
     Returns:
-        True if the set of primitives changed.
+        True if the edit added, removed or reordered primitives.
 
     Raises:
-        UserError: The edit does not fit the parameters.
+        UserError: The edit does not match the parameters.
     """
     if edit.is_empty:
         return False
@@ -234,12 +244,14 @@ def _check_edit(setup: Setup, state: TrainState, edit: Edit) -> None:
 
 
 def final_edits(setup: Setup, state: TrainState) -> Iterator[FinalEdit]:
-    """Apply and yield the final edits of a finished run; derived values are not updated.
+    """Apply and yield the final edits of a finished run.
 
-    If an error interrupts an edit, the state is as before this edit.
+    Values that the backbone derives are not updated.
+
+    If an error interrupts an edit, the state before this edit is kept.
 
     Raises:
-        UserError: An edit does not fit the parameters.
+        UserError: An edit does not match the parameters.
     """
     for hook in one_by_one(setup.manager, "crossgrad_final_edit"):
         shown = eval_parameters(setup, state)
@@ -264,7 +276,7 @@ def final_edits(setup: Setup, state: TrainState) -> Iterator[FinalEdit]:
 
 
 def put_in_order(setup: Setup, state: TrainState) -> None:
-    """Sort the primitives in Morton order after an edit, so that neighbours are near in memory."""
+    """Sort the primitives in Morton order, so that neighbours in space are near in memory."""
     rows = in_order(state.tensors, setup.blocks, setup.backbone.positions)
     if rows is not None:
         _apply(setup, state, Edit(source=rows))
@@ -302,10 +314,11 @@ def _gathered(name: str, old: PluginState, source: Tensor, fresh: Tensor, rows: 
 
 
 def take_step(setup: Setup, state: TrainState) -> StepRecord:
-    """Advance `state` by one step.
+    """Advance `state` by one training step.
 
     Raises:
-        NonFiniteError: A loss or gradient is not finite; `state` must not be used any more.
+        NonFiniteError: A loss or gradient is not finite. After this error, `state` must not be used
+            any more.
     """
     regroup_if_due(setup, state)
     state.step += 1
@@ -321,12 +334,12 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
     scale = setup.operator_scale.of(context)
     gradients = joined(aggregated.gradients, rendered.regular, of_step, scale)
     if setup.device.type == "cpu":
-        # Skip this check on a GPU, because it would wait for the device. The later check of the
-        # parameters is enough there.
+        # Skip this check on a GPU, because the check would wait for the GPU. On a GPU, the later
+        # check of the parameters finds the error.
         _check_finite(state, rendered, gradients, of_views)
     state.laps.lap("aggregation")
     counted = aggregated.counts
-    # Free the memory of the gradients, because an edit needs it.
+    # Free the memory of the gradients, because an edit needs memory.
     del of_views, context, aggregated, of_step
     counts = _finish(setup, state, rendered, gradients, scale)
     primitives = state.primitives(setup)
@@ -346,7 +359,7 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
 
 
 def sample_context(setup: Setup, state: TrainState, step: int) -> SampleContext:
-    """Return the context that the sampler would get if `step` were the next step."""
+    """Return the context that the sampler receives if `step` is the next step."""
     return SampleContext(
         **{**context_fields(setup, state, "sampler"), "step": step},
         views_per_step=setup.schedule.pace.at(step),
@@ -357,10 +370,10 @@ def sample_context(setup: Setup, state: TrainState, step: int) -> SampleContext:
 
 
 def check_largest_draw(setup: Setup) -> None:
-    """Check that the sampler can draw the largest K of the run, because trial steps may not use it.
+    """Check that the sampler can draw the largest K of the run. Trial steps may use a smaller K.
 
     Raises:
-        UserError: The sampler cannot draw this many views.
+        UserError: The sampler cannot draw the largest K.
     """
     blank = TrainState({}, AdamState(), make_streams(setup.config.seed))
     context = sample_context(setup, blank, 1)
@@ -391,7 +404,7 @@ def _sample(setup: Setup, state: TrainState) -> ViewSample:
 
 
 def _labels(setup: Setup, state: TrainState, draw: ViewSample) -> tuple[str, ...] | None:
-    """Return the labels of a draw as a tuple; a plugin may give a list or an array."""
+    """Return the labels of a draw as a tuple. A plugin may return a list or an array."""
     labels: object = draw.labels
     if labels is None:
         return None
@@ -441,7 +454,10 @@ def _aggregate(setup: Setup, state: TrainState, context: AggregateContext) -> Ag
 
 
 def _misfit(answer: AggregateResult, wanted: Mapping[str, Tensor]) -> str:
-    """Return the reason why a result does not fit the trained tensors; empty if it fits."""
+    """Return why a result does not match the trained tensors.
+
+    The text is empty for a matching result.
+    """
     for mapping in (answer.gradients, answer.counts):
         if not isinstance(mapping, Mapping):
             return f"{type(mapping).__name__}, not a mapping of names"
@@ -461,23 +477,23 @@ def _misfit(answer: AggregateResult, wanted: Mapping[str, Tensor]) -> str:
 def _finish(
     setup: Setup, state: TrainState, rendered: Rendered, gradients: TensorGradients, scale: Scale
 ) -> Mapping[str, int]:
-    """Run optimizer, density control and `after_step` in the order that the run uses.
+    """Run the optimizer, density control and later hooks in the order that `step_order` sets.
 
-    `gradients` is cleared after use.
+    The dictionary `gradients` is emptied after use.
     """
     state.touched = True
     if setup.numbers.step_order == "optimize-first":
         _optimize(setup, state, rendered, gradients, scale)
         gradients.clear()
         if setup.schedule.densifies(state.step):
-            # Finish the background updates first, because they hold gradients in memory that an
-            # edit needs.
+            # Finish the background updates first. The gradients of running updates use memory that
+            # an edit needs.
             state.late.finish()
         edit, edited = _densify(setup, state, rendered)
     else:
         edit, edited = _densify(setup, state, rendered)
-        # As published, an edit comes before the update and replaces tensors. Gradients of the
-        # replaced tensors are not used.
+        # As in the published 3DGS code, an edit comes before the optimizer and replaces tensors.
+        # Gradients of replaced tensors are not used.
         gone = set(gradients) if edited else set(edit.values)
         if state.step < setup.schedule.total:
             left = {name: g for name, g in gradients.items() if name not in gone}
@@ -497,7 +513,7 @@ def _optimize(
     progress = setup.schedule.progress(state.step)
     take_photo_step(setup, state, rendered.photos, progress)
     rates, rule = rates_at(setup, state.step), rule_at(setup, state.step)
-    # A regularisation term may give a gradient to a tensor that does not learn in this step.
+    # A regularization term may give a gradient to a tensor that is not updated in this step.
     resting = setup.resting(state.step)
     learning = {name: coalesced(g) for name, g in gradients.items() if name not in resting}
     waiting = set(setup.sparse_rows.values())
@@ -523,7 +539,10 @@ def _take_adam_step(
     rule: AdamRule,
     scale: Scale,
 ) -> None:
-    """Take Adam's step of whole tensors; positions may step along the axes of their Gaussians."""
+    """Take Adam's step of whole tensors.
+
+    With `per-axis`, position steps are scaled along the axes of each Gaussian.
+    """
     tensors, names = state.tensors, axes_of(setup)
     if names is None or gradients.get(names[0]) is None:
         adam_step(tensors, gradients, state.moments, rates, rule, scale.to_sum)
@@ -565,7 +584,7 @@ def _after_optimizer(setup: Setup, state: TrainState) -> None:
 
 
 def _after_step(setup: Setup, state: TrainState, *, edited: bool) -> bool:
-    """Run the hooks after the step; return True if the set of primitives changed."""
+    """Run the hooks after the step. Return True if primitives were added, removed or reordered."""
     changed = False
     context = _after_context(setup, state, edited=edited)
     for answer in call_all(setup.hook.crossgrad_after_step, context, DensifyResult):

@@ -1,4 +1,4 @@
-"""Strided rendering: one pixel of each n x n block is rendered, at a varying position."""
+"""Strided rendering: only one pixel of each n x n block is rendered, at a varying position."""
 
 from dataclasses import replace
 from math import isclose
@@ -13,28 +13,33 @@ from crossgrad_core.contract.slots.rasterizer import Rasterizer
 from crossgrad_core.numerics.hashing import hash32
 from crossgrad_core.training.scaled_photos import Pair
 
-#: Column and row of the first rendered pixel.
+#: Column and row of the first rendered pixel of an image.
 Corner = tuple[int, int]
 
 
 def stride_of(scale: float, camera: Camera) -> int:
-    """Return n for a scale 1 / n; 1 if the scale has another form or an image side is below n."""
+    """Return n for a scale of 1 / n.
+
+    Return 1 if the scale is not of this form, or if an image side has fewer than n pixels.
+    """
     whole = round(1.0 / scale)
     fits = isclose(whole * scale, 1.0) and whole <= min(camera.width, camera.height)
     return whole if fits else 1
 
 
 def corner_of(step: int, slot: int, stride: int) -> Corner:
-    """Return the pseudo-random pixel of each n x n block that a step renders for `slot`."""
+    """Return a pseudo-random pixel position in an n x n block.
+
+    `slot` is the position of the view in the step.
+    """
     cell = hash32(hash32(step) + slot) * stride * stride >> 32
     return cell % stride, cell // stride
 
 
 def camera_of(camera: Camera, stride: int, corner: Corner) -> Camera:
-    """Return the camera whose pixels are every n-th pixel of `camera`, starting at `corner`.
+    """Return the camera whose pixels are every n-th pixel of `camera`, from `corner` on.
 
-    The centre of pixel (i, j) of the new camera is the centre of pixel (corner + n (i, j)) of
-    `camera`.
+    The centre of pixel (i, j) of the result is the centre of pixel `corner` + n (i, j) of `camera`.
     """
     column, row = corner
     return replace(
@@ -49,7 +54,10 @@ def camera_of(camera: Camera, stride: int, corner: Corner) -> Camera:
 
 
 def pixels_of(pair: Pair, stride: int, corner: Corner) -> Pair:
-    """Return every n-th pixel of a photo [H, W, 3] and its mask [H, W] from `corner`, copied."""
+    """Return every n-th pixel of a photo [H, W, 3] and its mask [H, W], from `corner` on.
+
+    The results are copies.
+    """
     image, mask = pair
     column, row = corner
     taken = (slice(row, None, stride), slice(column, None, stride))
@@ -60,8 +68,9 @@ def _copied(pixels: Tensor) -> Tensor:
     """Return a contiguous copy of the pixels."""
     if not pixels.is_cpu:
         return pixels.contiguous()
-    # Torch would use a second thread and wait for it if cores are busy. Copy each channel
-    # separately, because NumPy is slow with an inner dimension of three.
+    # Torch would copy with a second thread. If all cores are busy, torch would wait for this
+    # thread. Copy each channel separately, because NumPy is slow if the inner dimension has only
+    # three elements.
     copy = torch.empty(pixels.shape, dtype=pixels.dtype)
     for channel in range(pixels.shape[2]):
         np.copyto(copy.numpy()[:, :, channel], pixels.numpy()[:, :, channel])
@@ -69,10 +78,12 @@ def _copied(pixels: Tensor) -> Tensor:
 
 
 def as_in_full(gaussians: Gaussians, rasterizer: Rasterizer, stride: int) -> Gaussians:
-    """Return the Gaussians with the dilation of the full photo, in units of n times wider pixels.
+    """Return the Gaussians with the dilation of the full-size image.
 
-    A render with this dilation and `camera_of` has the same values as the full render at these
-    pixels, except for Gaussians so far outside the image that their positions are clamped.
+    A pixel of the strided image is n times wider, which changes the unit of the dilation.
+
+    A render of these Gaussians with `camera_of` equals the full render at the rendered pixels.
+    Exceptions are Gaussians far outside the image, whose positions are clamped.
     """
     if stride == 1:
         return gaussians

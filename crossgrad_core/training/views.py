@@ -1,4 +1,4 @@
-"""Renders and backward passes of the K views of a step."""
+"""Render the K views of a step and run their backward passes."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -53,14 +53,14 @@ from crossgrad_core.wording import listed
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """The camera of a render of a view, and the photo that the render is compared with.
+    """The camera that renders a view, and the photo with which the render is compared.
 
     Attributes:
-        camera: The camera to render with.
-        scale: Side length of the render divided by the side length of the photo as trained.
-        photo: [H, W, 3] uint8.
-        mask: [H, W] bool; None if every pixel counts.
-        stride: n if the render contains one pixel of each n x n block of the photo.
+        camera: The camera for the render.
+        scale: Side length of the render, divided by the side length of the training photo.
+        photo: [H, W, 3] uint8, in the size of the render.
+        mask: [H, W] bool, True for valid pixels; None if all pixels are valid.
+        stride: n, if the render contains one pixel of each n x n block of the photo; otherwise 1.
     """
 
     camera: Camera
@@ -71,15 +71,15 @@ class Target:
 
 
 def target_at(setup: Setup, state: TrainState, index: int, scale: float, slot: int = 0) -> Target:
-    """Return camera and photo of a training view at a scale in (0, 1].
+    """Return the camera and the photo of a training view at a scale in (0, 1].
 
     Args:
-        setup: The run.
-        state: The state of the run.
-        index: The training view.
-        scale: The scale.
-        slot: Position of the view in the step; together with the step number, it determines the
-            pixels of a strided view.
+        setup: Setup of the run.
+        state: The training state.
+        index: Position of the view in the training views.
+        scale: Side length of the render, divided by the side length of the training photo.
+        slot: Position of the view in the step. With a stride, `slot` and the step number choose the
+            rendered pixels.
     """
     view = setup.train_views[index]
     stride, camera = _stride_at(setup, view, scale), photo_camera(setup, view, scale)
@@ -91,7 +91,7 @@ def target_at(setup: Setup, state: TrainState, index: int, scale: float, slot: i
 
 
 def photo_camera(setup: Setup, view: View, scale: float) -> Camera:
-    """Return the camera of the photo that gives the pixels of a view at this scale."""
+    """Return the camera of the photo from which the pixels of a view are taken at this scale."""
     return view.camera if _stride_at(setup, view, scale) > 1 else camera_at(view.camera, scale)
 
 
@@ -100,7 +100,7 @@ def _stride_at(setup: Setup, view: View, scale: float) -> int:
 
 
 def weights_of(setup: Setup, state: TrainState, index: int, target: Target) -> Tensor | None:
-    """Return [H, W], the weight of each pixel; None if all weights are equal."""
+    """Return [H, W], the weight of each pixel in the loss; None if all weights are equal."""
     if not setup.weighs:
         return None
     context = PixelContext(
@@ -119,7 +119,10 @@ def weights_of(setup: Setup, state: TrainState, index: int, target: Target) -> T
 
 
 def _fitting(weights: object, context: PixelContext, hook: HookCaller) -> Tensor:
-    """Return checked pixel weights; on a GPU only shape and type are checked, to avoid waiting."""
+    """Return the pixel weights of a plugin after a check.
+
+    On a GPU, only shape and type are checked, because other checks would wait for the GPU.
+    """
     shape = context.target.shape[:2]
     description, least = type(weights).__name__, ""
     if isinstance(weights, Tensor):
@@ -139,7 +142,7 @@ def _fitting(weights: object, context: PixelContext, hook: HookCaller) -> Tensor
 
 
 def camera_at(camera: Camera, scale: float) -> Camera:
-    """Return the camera resized by `scale`, rounded to whole pixels; unchanged at scale 1."""
+    """Return the camera resized by `scale`, with a whole number of pixels on each side."""
     width = max(1, round(camera.width * scale))
     height = max(1, round(camera.height * scale))
     if (width, height) == (camera.width, camera.height):
@@ -148,7 +151,7 @@ def camera_at(camera: Camera, scale: float) -> Camera:
 
 
 def context_fields(setup: Setup, state: TrainState, stream: str) -> dict[str, Any]:
-    """Return the fields that the contexts of all hooks of a step have in common."""
+    """Return the fields that all hook contexts of a step share."""
     return {
         "step": state.step,
         "schedule": setup.schedule,
@@ -160,12 +163,15 @@ def context_fields(setup: Setup, state: TrainState, stream: str) -> dict[str, An
 
 
 def photo_of(setup: Setup, state: TrainState, view: View) -> Pair:
-    """Return the photo and mask of a view on the run's device; decoding counts as loading."""
+    """Return the photo and the mask of a view on the run's device.
+
+    Decoding time counts as loading.
+    """
     return on_device(_decoded(state, view), setup.device)
 
 
 def _decoded(state: TrainState, view: View) -> Pair:
-    """Return the decoded photo and mask of a view in host memory."""
+    """Return the decoded photo and the mask of a view in host memory."""
     start, cpu = perf_counter(), thread_time()
     image, mask = view.photo.image(), view.photo.mask()
     seconds = perf_counter() - start
@@ -183,14 +189,14 @@ def background_of(setup: Setup, state: TrainState) -> Tensor:
 
 
 def eval_background(setup: Setup) -> Tensor:
-    """Return the background [3] RGB of evaluated views: black if the run's background is random."""
+    """Return the background [3] RGB for evaluation. A random background is replaced by black."""
     name = setup.config.background
     named = {"black": (0.0, 0.0, 0.0), "random": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
     rgb = named[name] if name in named else tuple(float(level) for level in name.split(","))
     return torch.tensor(rgb, dtype=torch.float32).to(setup.device, non_blocking=True)
 
 
-#: Tensor name -> gradient or None.
+#: Tensor name -> gradient, or None without a gradient.
 TensorGradients = dict[str, Tensor | None]
 
 
@@ -201,7 +207,10 @@ def add_regularization(
     gaussians: Gaussians | None = None,
     view: View | None = None,
 ) -> None:
-    """Add the gradients of the regularisation terms of a view (None: of the whole step)."""
+    """Add the gradients of regularization terms to `into`.
+
+    The terms belong to `view`. If `view` is None, the terms belong to the whole step.
+    """
     context = RegularizeContext(
         **context_fields(setup, state, "regularize"),
         parameters=state.current,
@@ -237,16 +246,16 @@ def joined(
     of_step: TensorGradients,
     scale: Scale,
 ) -> TensorGradients:
-    """Return the aggregated gradients plus the gradients of the regularisation terms.
+    """Return the aggregated gradients plus the gradients of the regularization terms.
 
-    The terms are multiplied by the operator's scale c(K), so that their weight against the
-    photometric loss does not depend on the operator. The factor is c(K) for terms of the step and
-    c(K) / K for terms of a view.
+    The terms are multiplied by the operator's factor c(K). The weight of the terms relative to the
+    photometric loss therefore does not depend on the operator. The factor is c(K) for terms of the
+    whole step, and c(K) / K for terms of a view.
 
     Args:
-        gradients: The aggregated gradients.
-        of_views: The sum of the gradients of the views' terms.
-        of_step: The sum of the gradients of the step's terms.
+        gradients: The aggregated gradients of the photometric losses.
+        of_views: Sum of the gradients of all terms of single views.
+        of_step: Sum of the gradients of all terms of the whole step.
         scale: The scale of the operator's result for K equal gradients.
     """
     regular = _times(of_views, scale.per_view)
@@ -257,7 +266,10 @@ def joined(
 
 
 def _times(gradients: TensorGradients, factors: Mapping[str, float]) -> TensorGradients:
-    """Return the gradients times the factors of their tensors, without gradients of factor 0."""
+    """Return the gradients, multiplied by the factors of their tensors.
+
+    Gradients with a factor of 0 are left out.
+    """
     return {
         name: gradient if factors[name] == 1.0 else gradient * factors[name]
         for name, gradient in gradients.items()
@@ -267,12 +279,13 @@ def _times(gradients: TensorGradients, factors: Mapping[str, float]) -> TensorGr
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """The views of one step after their backward passes.
+    """The views of a step after their backward passes.
 
     Attributes:
-        records: One record per view.
-        regular: Sum of the gradients of the views' regularisation terms.
-        photos: Position of each view and the values of its photo, with their gradients.
+        records: One record for each view.
+        regular: Sum of the gradients of the views' regularization terms.
+        photos: For each view: its position in the training views, and the exposure parameters of
+            its photo with their gradients.
         observed: The records that density control receives.
     """
 
@@ -284,7 +297,7 @@ class Rendered:
 
 @dataclass(frozen=True, eq=False)
 class _Prepared:
-    """A view that is ready for the render."""
+    """A view whose photo and Gaussians are ready to be rendered."""
 
     slot: int
     target: Target
@@ -294,7 +307,7 @@ class _Prepared:
 
 @dataclass(frozen=True, eq=False)
 class _Drawn:
-    """A rendered view with its graph. The record does not contain the loss yet."""
+    """A rendered view with its autograd graph. The record does not yet contain the loss."""
 
     record: ViewRecord
     gaussians: Gaussians
@@ -303,7 +316,7 @@ class _Drawn:
 
 
 def scales_of(setup: Setup, state: TrainState, draw: ViewSample) -> tuple[float, ...]:
-    """Return the scales at which the views of `draw` are rendered."""
+    """Return the image scales at which the views of `draw` are rendered."""
     context = ScaleContext(**context_fields(setup, state, "resolution"), draw=draw, last=state.last)
     answer = call_first_result(setup.hook.crossgrad_choose_scales, context, ScaleResult)
     state.accept(answer.states, setup.hook.crossgrad_choose_scales)
@@ -324,10 +337,10 @@ def scales_of(setup: Setup, state: TrainState, draw: ViewSample) -> tuple[float,
 def render_views(
     setup: Setup, state: TrainState, draw: ViewSample, scales: Sequence[float]
 ) -> tuple[Rendered, Gradients]:
-    """Render the views of `draw` and return them with their gradients, separate or summed.
+    """Render the views of `draw`. Return the renders and their gradients, separate or summed.
 
     Raises:
-        NonFiniteError: A loss is not finite.
+        NonFiniteError: The loss of a view is not finite.
     """
     regular: TensorGradients = {}
     if setup.joint:
@@ -348,13 +361,13 @@ def render_views(
     state.counters.backward_passes += len(records)
     if not setup.separate:
         return Rendered(with_losses, regular, tuple(photos)), total
-    # The operator may overwrite the separate gradients, unless a plugin reads them.
+    # The operator may overwrite the separate gradients, unless a plugin reads the gradients later.
     apart = DenseGradients(per_view, setup.trained_blocks, overwrite=not setup.watchers)
     return Rendered(with_losses, regular, tuple(photos)), apart
 
 
 def _sums(setup: Setup, views: int) -> SummedGradients | DeferredSums:
-    """Return an empty sum for the gradients of `views` views."""
+    """Return an empty sum to which the gradients of `views` views are added."""
     if setup.device.type == "cpu":
         return SummedGradients.empty(setup.trained_blocks, views)
     return DeferredSums(setup.trained_blocks, views)
@@ -367,7 +380,10 @@ def _one_by_one(
     scales: Sequence[float],
     regular: TensorGradients,
 ) -> Iterator[tuple[_Drawn, TensorGradients]]:
-    """Yield each view with its gradients; render and backward pass run view by view."""
+    """Yield each view with its gradients.
+
+    Each view is rendered and its backward pass is run before the next view.
+    """
     _clear(state.tensors)
     for slot in range(len(draw.views)):
         drawn = _draw_view(setup, state, draw, slot, scales[slot])
@@ -384,10 +400,12 @@ def _together(
     scales: Sequence[float],
     regular: TensorGradients,
 ) -> Iterator[tuple[_Drawn, TensorGradients]]:
-    """Yield each view with its gradients; all views share one render call and one backward pass.
+    """Yield each view with its gradients.
 
-    This backward pass ends at copies of the decoded Gaussians of each view. A second backward pass
-    per view continues from these copies to the parameters.
+    All views share one call of the rasterizer and one backward pass.
+
+    The shared backward pass ends at copies of each view's decoded Gaussians. For each view, a
+    second backward pass continues from these copies to the parameters.
     """
     _clear(state.tensors)
     slots = range(len(draw.views))
@@ -415,8 +433,8 @@ def _leaf(tensor: Tensor) -> Tensor:
 
 
 def _pass_back(decoded: Gaussians, copy: Gaussians) -> None:
-    """Propagate the gradients of the copied Gaussians back to the parameters."""
-    # The copy of a tensor that needs no gradient has no gradient.
+    """Propagate the gradients of the copied Gaussians to the parameters."""
+    # If a tensor requires no gradient, its copy has no gradient.
     pairs = [(t, c.grad) for t, c in zip(decoded.floats(), copy.floats(), strict=True)]
     given = [(tensor, gradient) for tensor, gradient in pairs if gradient is not None]
     torch.autograd.backward([t for t, _ in given], [g for _, g in given])
@@ -425,10 +443,12 @@ def _pass_back(decoded: Gaussians, copy: Gaussians) -> None:
 def _with_losses(
     state: TrainState, records: Sequence[ViewRecord], losses: Sequence[Tensor]
 ) -> tuple[ViewRecord, ...]:
-    """Return the records with their losses; the host reads all losses at once and waits once.
+    """Return the records with their losses.
+
+    All losses are read at once, so that the CPU waits for the GPU only once.
 
     Raises:
-        NonFiniteError: A loss is not finite.
+        NonFiniteError: The loss of a view is not finite.
     """
     values = torch.stack(list(losses)).tolist()
     for record, value in zip(records, values, strict=True):
@@ -444,7 +464,10 @@ def _render_jointly(
     scales: Sequence[float],
     regular: TensorGradients,
 ) -> tuple[Rendered, Gradients]:
-    """Run one backward pass through the summed losses, as a reference; all graphs stay alive."""
+    """Run one backward pass through the sum of all losses.
+
+    The autograd graphs of all views exist in parallel.
+    """
     _clear(state.tensors)
     drawn = [_draw_view(setup, state, draw, slot, scale) for slot, scale in enumerate(scales)]
     losses = [view.loss.detach() for view in drawn]
@@ -463,7 +486,7 @@ def _render_jointly(
 def _prepare(
     setup: Setup, state: TrainState, draw: ViewSample, slot: int, scale: float
 ) -> _Prepared:
-    """Return the photo and the decoded Gaussians of a view of the draw."""
+    """Return the photo and the decoded Gaussians of one view of `draw`."""
     target = target_at(setup, state, draw.views[slot], scale, slot)
     background = background_of(setup, state)
     state.laps.lap("photos")
@@ -481,7 +504,7 @@ def _prepare(
 
 
 def _outputs(setup: Setup, state: TrainState) -> frozenset[str]:
-    """Return the optional statistics to compute; none after the end of density control."""
+    """Return the statistics that the densifier needs; empty after the end of density control."""
     return setup.densifier.needs if setup.schedule.collects(state.step) else frozenset()
 
 
@@ -498,7 +521,7 @@ def _draw_view(
 def _compare(
     setup: Setup, state: TrainState, draw: ViewSample, view: _Prepared, render: Render
 ) -> _Drawn:
-    """Compare the render of a view with its photo: compute loss and record."""
+    """Compare the render of a view with its photo. Return the loss and the record of the view."""
     index, target = draw.views[view.slot], view.target
     leaves = leaves_of(setup, state, index)
     image = setup.exposure.apply(render.image, leaves)
@@ -523,14 +546,18 @@ def _compare(
 
 
 def _seen(setup: Setup, state: TrainState, camera: Camera) -> Gaussians:
-    """Return the decoded Gaussians of a view; some rows are updated only when they are rendered."""
+    """Return the decoded Gaussians of a view.
+
+    Rows with deferred steps are updated when they are rendered.
+    """
     phase = setup.phase(state.step, training=True)
     tensors = _learning(setup, state)
     answer = setup.backbone.decode(tensors, camera, phase)
     gaussians = answered(answer, Gaussians, setup.backbone, "decode")
     names = {f: n for f, n in setup.sparse_rows.items() if getattr(gaussians, f) is tensors[n]}
     if names.keys() != {f for f in setup.sparse_rows if getattr(gaussians, f) is not None}:
-        # `decode` did not pass a tensor through unchanged, so `decode` may have read outdated rows.
+        # The decoded Gaussians do not share a tensor with the parameters, so `decode` may have read
+        # rows with deferred steps.
         state.settle()
         return setup.backbone.decode(tensors, camera, phase)
     if not names or not is_native([state.tensors[name] for name in names.values()]):
@@ -544,7 +571,7 @@ def _seen(setup: Setup, state: TrainState, camera: Camera) -> Gaussians:
 
 
 def _learning(setup: Setup, state: TrainState) -> Parameters:
-    """Return the parameters in memory; tensors that do not learn in this step are detached."""
+    """Return the parameters in memory. Tensors that are not updated in this step are detached."""
     resting = setup.resting(state.step)
     if not resting:
         return state.tensors
@@ -552,7 +579,9 @@ def _learning(setup: Setup, state: TrainState) -> Parameters:
 
 
 def observe_view(setup: Setup, state: TrainState, draw: ViewSample, scale: float) -> ViewRecord:
-    """Render the single view of `draw` for its statistics; its gradients are discarded.
+    """Render the single view of `draw` to collect its statistics.
+
+    The gradients of this view are discarded.
 
     Raises:
         NonFiniteError: The loss of the view is not finite.
@@ -573,7 +602,8 @@ def _regularize_view(setup: Setup, state: TrainState, drawn: _Drawn, into: Tenso
 
 
 def _backward(loss: Tensor) -> None:
-    # A view without visible Gaussians has a constant image and no gradients. This is not an error.
+    # If no Gaussian is visible, the image is constant and has no gradients. A view without visible
+    # Gaussians is not an error.
     if loss.requires_grad:
         loss.backward()  # type: ignore[no-untyped-call]
 
@@ -591,12 +621,12 @@ def _take(parameters: Mapping[str, Tensor]) -> TensorGradients:
 
 @dataclass(frozen=True, eq=False)
 class RenderCallback:
-    """A `RenderOnRequest` that renders training views with the present parameters.
+    """A function that renders training views for plugins, with the present parameters.
 
     Attributes:
-        setup: The run.
-        state: The state of the run.
-        counted: True if the renders count as rendered views.
+        setup: Setup of the run.
+        state: The training state.
+        counted: True if the renders of this function are included in the number of rendered views.
     """
 
     setup: Setup
@@ -610,10 +640,10 @@ class RenderCallback:
         outputs: frozenset[str] = frozenset(),
         background: Tensor | None = None,
     ) -> RequestedRender:
-        """Return the rendered view; see `RenderOnRequest`.
+        """Return the rendered view, as described in `RenderOnRequest`.
 
         Raises:
-            UserError: There is no such view, or the scale is out of bounds.
+            UserError: The view does not exist, or the scale is not in (0, 1].
         """
         setup, state = self.setup, self.state
         _check(setup, view, scale)

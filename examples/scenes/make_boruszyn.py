@@ -3,8 +3,8 @@
     python make_boruszyn.py SOURCE TARGET
 
 Photos and camera are resized to 400 px; every SfM point is kept. To keep the scene small, each
-track keeps every eighth observation, and at least one. Observations show which view saw which part
-of the scene; training starts from the points alone.
+track keeps only every eighth observation, and at least one. The observations show which view saw
+which part of the scene. Training itself starts from the points alone.
 """
 
 import sys
@@ -46,7 +46,7 @@ def thin_tracks(source: pycolmap.Reconstruction) -> dict[int, list[tuple[int, in
     kept = {}
     for point_id, point in sorted(source.points3D.items()):
         elements = sorted((e.image_id, e.point2D_idx) for e in point.track.elements)
-        # Start each track at another photo, so that all photos keep the same share of their
+        # Start each track at another photo, so that all photos keep equal shares of their
         # observations.
         kept[point_id] = elements[point_id % min(len(elements), KEPT_SHARE) :: KEPT_SHARE]
     return kept
@@ -93,8 +93,8 @@ def main(source: Path, target: Path) -> None:
         path = target / "images" / image.name
         Image.fromarray(photo).save(path, quality=QUALITY, optimize=True, progressive=True)
     model.write_binary(target / "sparse" / "0")
-    # Delete the rigs and frames. For single cameras, they add no information to the cameras and
-    # images.
+    # Delete the rigs and frames, because they contain no information besides cameras and images of
+    # single cameras.
     for name in ("rigs.bin", "frames.bin"):
         (target / "sparse" / "0" / name).unlink(missing_ok=True)
     (target / "README.txt").write_text(README, encoding="utf-8")

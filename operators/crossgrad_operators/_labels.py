@@ -1,4 +1,4 @@
-"""Checks for operators that need to know the group of each view."""
+"""Checks for operators that need the group of each view."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -7,7 +7,7 @@ from crossgrad_core.plugin import OperatorContext, Selection, UserError
 
 
 def labels_of(context: OperatorContext, operator: str) -> tuple[str, ...]:
-    """Return the labels of the views.
+    """Return the labels of the views, which name their groups.
 
     Raises:
         UserError: The views have no labels.
@@ -25,14 +25,14 @@ def labels_of(context: OperatorContext, operator: str) -> tuple[str, ...]:
 def label_objections(
     selection: Selection, needed: Mapping[str, str] = MappingProxyType({})
 ) -> list[str]:
-    """Return reasons why views will have no labels, or lack labels that the options name."""
+    """Return reasons why views will have no labels, or will lack labels that the options name."""
     name, sampler = selection.names["operator"], selection.names["sampler"]
     grouping = selection.grouping
     if selection.sampler.own_labels:
         source, given = f"sampler {sampler}", selection.sampler.own_labels
     elif grouping is not None:
-        # A grouping by folders or lists takes its labels from the scene and has no labels of its
-        # own.
+        # A grouping by folders or lists takes its labels from the scene. The field `labels` of such
+        # a grouping is empty.
         source = f"grouping {selection.names['grouping']}"
         given = grouping.labels if selection.labels is None else selection.labels
     else:

@@ -1,4 +1,4 @@
-"""Numbers that an operator stores between steps for each Gramian."""
+"""Store numbers of an operator between steps, separately for each Gramian."""
 
 from collections.abc import Iterator
 from itertools import groupby
@@ -9,14 +9,17 @@ from numpy.typing import NDArray
 
 from crossgrad_core.plugin import OperatorContext, PluginState
 
-#: If there are more Gramians than this, each Gramian belongs to one Gaussian.
+#: If there are more Gramians than this number, each Gramian belongs to one primitive.
 _BLOCKS = 64
 
 
 def recall(
     state: PluginState, context: OperatorContext, key: str, shape: tuple[int, ...]
 ) -> NDArray[np.float64]:
-    """Return [B, *shape] stored under `key`, or zeros at first and after a change of shape."""
+    """Return the numbers [B, *shape] that are stored under `key`.
+
+    Return zeros at the start and after a change of shape.
+    """
     if _by_block(context):
         return _known(state.tensors.get(key), (len(context.blocks), *shape))
     parts = []
@@ -29,9 +32,9 @@ def recall(
 def remember(
     state: PluginState, context: OperatorContext, key: str, values: NDArray[np.float64]
 ) -> PluginState:
-    """Return the state with `values` [B, ...] under `key`.
+    """Return the state with `values` [B, ...] stored under `key`.
 
-    If primitives move to other rows of their tensors, the stored values move with them.
+    If density control moves primitives to other rows, the stored values move with them.
     """
     tensors, rows_of = dict(state.tensors), dict(state.per_primitive)
     if _by_block(context):
@@ -46,7 +49,7 @@ def remember(
 
 
 def _known(kept: torch.Tensor | None, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return a copy of the stored values, or zeros if they are missing."""
+    """Return a copy of the stored values. Return zeros if no values are stored."""
     if kept is None or tuple(kept.shape) != shape:
         return np.zeros(shape)
     stored: NDArray[np.float64] = kept.cpu().numpy().astype(np.float64)
@@ -54,15 +57,18 @@ def _known(kept: torch.Tensor | None, shape: tuple[int, ...]) -> NDArray[np.floa
 
 
 def _by_block(context: OperatorContext) -> bool:
-    """Return whether each Gramian has its own block: few Gramians, all names different."""
+    """Return True if each Gramian belongs to its own block.
+
+    If each block has its own Gramian, there are few Gramians, and all names differ.
+    """
     blocks = context.blocks
     return len(blocks) <= _BLOCKS and len(set(blocks)) == len(blocks)
 
 
 def _runs(context: OperatorContext) -> Iterator[tuple[str, int]]:
-    """Yield each block's name and number of Gramians.
+    """Yield the name of each block and its number of Gramians.
 
-    A number above 1 means one Gramian per primitive.
+    A number above 1 means that each primitive has its own Gramian.
     """
     for name, run in groupby(context.blocks):
         yield name, sum(1 for _ in run)

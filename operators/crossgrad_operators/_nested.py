@@ -1,4 +1,7 @@
-"""Operators that contain operators: built from names or configurations, with nested states."""
+"""Operators that contain other operators.
+
+Inner operators are built from names or options, and their states are nested.
+"""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -23,7 +26,7 @@ STATE_SEPARATOR = "/"
 
 
 def operator_of(value: object) -> MatrixOperator:
-    """Return an operator, given itself, its name, or `{name: ..., option: ...}`."""
+    """Return an operator. The value is an operator, its name, or `{name: ..., option: ...}`."""
     if isinstance(value, Operator):
         return _checked(value)
     if isinstance(value, str):
@@ -48,14 +51,14 @@ def _checked(operator: Operator) -> MatrixOperator:
     return operator
 
 
-#: A field that holds an operator. It is serialized as the operator's name and options.
+#: A pydantic field that contains an operator. The operator is serialized as its name and options.
 OperatorField: TypeAlias = Annotated[
     MatrixOperator, BeforeValidator(operator_of), PlainSerializer(plain_component)
 ]
 
 
 def reads_gramians(operators: Iterable[MatrixOperator]) -> bool:
-    """Return True if any of these operators depends on the Gramians."""
+    """Return True if the result of any operator depends on the Gramians."""
     return any(
         isinstance(operator, GramianOperator) and operator.reads_gramians()
         for operator in operators
@@ -63,12 +66,15 @@ def reads_gramians(operators: Iterable[MatrixOperator]) -> bool:
 
 
 def first_grouping(operators: Iterable[MatrixOperator]) -> str | None:
-    """Return the grouping of the first operator that needs a grouping, or None."""
+    """Return the grouping of the first operator that needs a grouping.
+
+    Return None if no operator needs a grouping.
+    """
     return next(filter(None, (operator.resolved_grouping for operator in operators)), None)
 
 
 def inner_state(state: PluginState, key: str) -> PluginState:
-    """Return the part of a state that belongs to the inner operator with this key."""
+    """Return the part of a state that belongs to the inner operator with key `key`."""
     start = key + STATE_SEPARATOR
     return PluginState(
         values=_inner(state.values, start),
@@ -78,7 +84,7 @@ def inner_state(state: PluginState, key: str) -> PluginState:
 
 
 def outer_state(states: Mapping[str, PluginState]) -> PluginState:
-    """Return one state that contains the states of all inner operators, by key."""
+    """Return a state that contains the states of all inner operators, by key."""
     return PluginState(
         values=_outer({key: state.values for key, state in states.items()}),
         tensors=_outer({key: state.tensors for key, state in states.items()}),
@@ -87,7 +93,7 @@ def outer_state(states: Mapping[str, PluginState]) -> PluginState:
 
 
 def inner_objections(selection: Selection, operator: Operator) -> list[str]:
-    """Return the objections of an inner operator to a selection."""
+    """Return the objections of an inner operator to the selected components."""
     name = component_name(operator)
     seen = replace(selection, operator=operator, names={**selection.names, "operator": name})
     validate = getattr(operator, "crossgrad_validate_selection", None)
@@ -95,7 +101,7 @@ def inner_objections(selection: Selection, operator: Operator) -> list[str]:
 
 
 def inner_idle(selection: Selection, option: str, operators: Iterable[Operator]) -> dict[str, str]:
-    """Return a message for the option with inner operators, if their options have no effect."""
+    """Return a message for `option` if the inner operators have options without effect."""
     messages = [
         f"{component_name(operator)}.{name}: {why}"
         for operator in operators

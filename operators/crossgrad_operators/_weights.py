@@ -1,4 +1,4 @@
-"""Weights that are computed in 16 or 32 digits, as the gradients require."""
+"""Compute weights with 16 digits, or with 32 digits if the gradients require more precision."""
 
 from collections.abc import Callable
 from typing import Final, Literal, Protocol
@@ -22,20 +22,19 @@ def refine(
     context: OperatorContext,
     exact: Callable[[Floats, Floats, Flags], Floats],
 ) -> Floats:
-    """Recompute ill-conditioned weights with 32 digits.
+    """Recompute ill-conditioned weights with 32 digits, and return all weights.
 
     Args:
-        weights: [B, K] or rows [B, K, K], changed in place.
-        ill_conditioned: [B] True for weights to recompute.
-        gramians: [B, K, K].
-        context: Gives the views that are present, and the rounding residuals of the Gramians. If
-            the residuals are unknown, the weights are not changed.
-        exact: Function from ill-conditioned Gramians, their residuals and presence [n, K] to
-            their weights.
+        weights: [B, K] weights or [B, K, K] rows of weights, changed in place.
+        ill_conditioned: [B] True for weights that are recomputed.
+        gramians: [B, K, K] Gramians.
+        context: The context, which contains the views that are present and the rounding residuals
+            of the Gramians. If the residuals are unknown, no weights change.
+        exact: Function that returns weights from Gramians, their residuals and presence [n, K],
+            with 32 digits.
 
     Returns:
-        `weights`.
-        `weights`.
+        The array `weights`.
     """
     if context.rounding_residuals is not None and ill_conditioned.any():
         blocks = np.flatnonzero(ill_conditioned)
@@ -46,7 +45,7 @@ def refine(
 
 
 class CautiousKernel(Protocol):
-    """A kernel with an argument for the relative error above which 16 digits are not enough."""
+    """A kernel that also receives the largest relative error for which 16 digits are enough."""
 
     def __call__(
         self,
@@ -60,7 +59,7 @@ class CautiousKernel(Protocol):
 
 
 def doubted(kernel: CautiousKernel, gramians: Floats, context: OperatorContext) -> Floats:
-    """Return weights of 16 digits, or of 32 digits if the 16-digit weights are ill-conditioned."""
+    """Return weights with 16 digits. Ill-conditioned weights are recomputed with 32 digits."""
     nothing = np.zeros_like(gramians)
     weights, ill_conditioned = kernel(gramians, nothing, context.present, context.unit, None)
 
@@ -71,7 +70,10 @@ def doubted(kernel: CautiousKernel, gramians: Floats, context: OperatorContext) 
 
 
 class Kernel(Protocol):
-    """A kernel: Gramians, residuals, presence, True for 32 digits -> weights, ill-conditioned."""
+    """A kernel that returns weights, and True for blocks with ill-conditioned weights.
+
+    The arguments of the kernel are Gramians, residuals, presence, and True for 32 digits.
+    """
 
     def __call__(
         self,
@@ -84,11 +86,11 @@ class Kernel(Protocol):
 
 
 def extended_precision(kernel: Kernel, gramians: Floats, context: OperatorContext) -> Floats:
-    """Return weights with as many digits as the gradients require.
+    """Return weights with as many digits as the type of the gradients requires.
 
-    Gradients with a type finer than float32 get 32 digits if the residuals of their Gramians are
-    known. Other gradients get 16 digits, and 32 digits if the kernel finds their weights
-    ill-conditioned.
+    For types more precise than float32, weights are computed with 32 digits if the residuals of the
+    Gramians are known. For other types, weights are computed with 16 digits. Weights that the
+    kernel marks as ill-conditioned are recomputed with 32 digits.
     """
     if context.unit < FLOAT32 and context.rounding_residuals is not None:
         return kernel(gramians, context.rounding_residuals(), context.present, True)[0]

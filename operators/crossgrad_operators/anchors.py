@@ -20,10 +20,11 @@ from crossgrad_operators.projection import project, slot_order
 
 
 class Anchors(GramianOperator):
-    """`symmetric` between a nearest and a farthest view, and `sum` between other views.
+    """The operator `symmetric` for a near and a far anchor view, and `sum` for other pairs.
 
-    Use this operator with the sampler `anchors-30`: the nearest and the farthest 30 % of the
-    cameras are anchors. The remaining cameras contribute plain photometric gradients.
+    Use this operator with the sampler `anchors-30`. The anchors of this sampler are the nearest and
+    the farthest 30 % of the cameras. The gradients of the remaining cameras are added without a
+    projection.
     """
 
     views: ClassVar[ViewCounts] = ViewCounts(2, 2)
@@ -50,5 +51,5 @@ class Anchors(GramianOperator):
 
     @hookimpl
     def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
-        """Refuse samplers whose views have no labels."""
+        """Return objections to samplers whose views lack the two labels."""
         return label_objections(selection, {"near": self.near, "far": self.far})

@@ -1,4 +1,4 @@
-"""Operators that balance the gradients: Aligned-MTL, IMTL-G and Nash-MTL."""
+"""Operators that balance the gradients of the views: Aligned-MTL, IMTL-G and Nash-MTL."""
 
 from typing import ClassVar
 
@@ -11,11 +11,13 @@ from crossgrad_operators._weights import doubted
 
 
 class Aligned(Weighting):
-    """Reduction of all singular values of the gradient matrix to its smallest singular value.
+    """Reduce all singular values of the gradient matrix to its smallest singular value.
 
-    G = V L V^T; w = sqrt(l_min) V L^-1/2 V^T p with p = 1/K and l_min the smallest eigenvalue above
-    K eps l_max. If an eigenvalue falls below this limit, the result u is discontinuous: the
-    eigenvalue's direction is omitted, so l_min becomes the next larger eigenvalue.
+    With the eigenvalues L and eigenvectors V of the Gramian, G = V L V^T, the weights are w =
+    sqrt(l_min) V L^-1/2 V^T p. Here p = 1/K, and l_min is the smallest eigenvalue above the limit K
+    eps l_max. The result is not continuous where an eigenvalue is at the limit K eps l_max. Below
+    the limit, the direction of an eigenvalue is left out, and l_min becomes the next larger
+    eigenvalue.
 
     Source: Senushkin et al. 2023, "Independent component alignment".
     """
@@ -32,11 +34,12 @@ class Aligned(Weighting):
 
 
 class IMTLG(Weighting):
-    """The combination with equal projections on all unit gradients and weights that add up to 1.
+    """The combination with equal projections on all unit gradients, and with weights of sum 1.
 
-    G v = (|g_k|), w = v / sum v. For two views, w = (|g_2|, |g_1|) / (|g_1| + |g_2|): the bisector.
-    If G is singular, v is the shortest least-squares solution. If the sum of v is zero, or if the
-    result is only rounding noise, the result is zero.
+    The equations are G v = (|g_k|) with the Gramian G, and w = v / sum v. For two views, w =
+    (|g_2|, |g_1|) / (|g_1| + |g_2|), and the result is the bisector. If G is singular, v is the
+    least-squares solution with the smallest norm. If the sum of v is zero, or if only rounding
+    noise remains, the result is zero.
 
     Source: Liu et al. 2021, "Towards impartial multi-task learning".
     """
@@ -53,12 +56,13 @@ class IMTLG(Weighting):
 
 
 class Nash(Weighting):
-    """The bargaining solution: alpha > 0 with G alpha = 1 / alpha, u = sum alpha_k g_k.
+    """The Nash bargaining solution: alpha > 0 with G alpha = 1 / alpha, and u = sum alpha_k g_k.
 
-    Two views use a closed form. More views use damped Newton steps (decrement 1e-13). The length
-    |u| of the plain solution is always sqrt(K). The plain solution is multiplied by the geometric
-    mean of the norms. Therefore u scales with the gradients, and a single view is unchanged. The
-    result is zero if the gradients are exactly opposite.
+    For two views, a closed form is used. For more views, damped Newton steps are used until the
+    Newton decrement is below 1e-13. Without scaling, the length |u| would always be sqrt(K). The
+    solution is therefore multiplied by the geometric mean of the gradient norms. After this
+    scaling, u is proportional to the gradients, and a single view is unchanged. If the gradients
+    are exactly opposite, the result is zero.
 
     Source: Navon et al. 2022, "Multi-task learning as a bargaining game".
     """

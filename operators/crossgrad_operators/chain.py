@@ -29,17 +29,17 @@ from crossgrad_operators._nested import (
     reads_gramians,
 )
 
-#: A row of a product counts as rounding noise if its length is below this share of the length of
+#: A row of the matrix counts as rounding noise if its length is below this share of the length of
 #: its terms.
 _NOISE = 1e-14
 
 
 class Chain(GramianOperator):
-    """A sequence of operators, each of which transforms the result of the operator before it.
+    """A sequence of operators. Each operator transforms the result of the previous operator.
 
-    The chain's matrix is the product of the matrices of its links, and the resulting rows are
-    added. Each link receives M Gram M^T, so no link computes on arrays of parameter size. Without
-    links, the chain equals `sum`.
+    The matrix of the chain is the product of the matrices of its operators (links). The resulting
+    rows are added. Each link receives only the K x K Gramian M G M^T, where M is the product of the
+    earlier matrices. Without links, the chain equals `sum`.
     """
 
     links: tuple[OperatorField, ...] = Field(
@@ -68,7 +68,7 @@ class Chain(GramianOperator):
         return any(link.reads_labels() for link in self.links)
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """Return the options without an effect; see `HasUnusedOptions`."""
+        """Return the options that have no effect (see `HasUnusedOptions`)."""
         return inner_idle(selection, "links", self.links)
 
     @override
@@ -107,7 +107,7 @@ class Chain(GramianOperator):
 def _noise(
     seen: NDArray[np.float64], product: NDArray[np.float64], gramians: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Return the rows [B, R] of M G that are zero, or only rounding noise of cancelling terms."""
+    """Return True for rows [B, R] of M G that are zero or only cancellation noise."""
     norms = np.sqrt(np.diagonal(gramians, axis1=1, axis2=2))
     terms = np.abs(product) @ norms[:, :, None]
     empty: NDArray[np.bool_] = np.diagonal(seen, axis1=1, axis2=2) <= _NOISE * terms[:, :, 0] ** 2
@@ -120,7 +120,10 @@ def _remainders(
     context: OperatorContext,
     seen: NDArray[np.float64],
 ) -> Callable[[], NDArray[np.float64]] | None:
-    """Return a function for the rounding residuals of M Gram M^T, or None if they are unknown."""
+    """Return a function that computes the rounding residuals of M G M^T.
+
+    Return None if the residuals of G are unknown.
+    """
     whole = context.rounding_residuals
     if whole is None:
         return None

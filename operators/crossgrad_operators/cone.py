@@ -1,4 +1,4 @@
-"""Projection onto the cone of directions without a conflict: UPGrad and DualProj."""
+"""Project onto the cone of directions that conflict with no gradient: UPGrad and DualProj."""
 
 from typing import ClassVar
 
@@ -11,11 +11,12 @@ from crossgrad_operators._weights import extended_precision
 
 
 class UPGrad(GramianOperator):
-    """The mean of the gradients, each projected onto the cone of conflict-free directions.
+    """Project each gradient onto the cone of conflict-free directions, and average the results.
 
-    For each k: v_k = argmin v^T G v subject to v >= e_k / K; u is the sum of all v_k G. For two
-    views u is half of the result of `symmetric`. Two views use a closed form. More views use the
-    active sets of Lawson and Hanson. Gradients in float64 use 32 digits.
+    For each view k, v_k = argmin v^T G v subject to v >= e_k / K. The result u is the sum of all
+    combinations v_k of the gradients. For two views, u is half of the result of `symmetric`. For
+    two views, a closed form is used. For more views, the active-set method of Lawson and Hanson is
+    used. For float64 gradients, weights are computed with 32 digits.
 
     Source: Quinton and Rey 2024, "Jacobian descent for multi-objective optimization".
     """
@@ -36,12 +37,13 @@ class UPGrad(GramianOperator):
 
 
 class DualProj(Weighting):
-    """The mean gradient, projected onto the cone of conflict-free directions.
+    """Project the mean gradient onto the cone of conflict-free directions.
 
-    v = argmin v^T G v subject to v >= 1/K; u = v G. Two views use a closed form. More views use the
-    active sets of Lawson and Hanson. Gradients in float64 use 32 digits.
+    The weights are v = argmin v^T G v subject to v >= 1/K, with the Gramian G. For two views, a
+    closed form is used. For more views, the active-set method of Lawson and Hanson is used. For
+    float64 gradients, weights are computed with 32 digits.
 
-    Source: Lopez-Paz and Ranzato 2017; the weighting has the same name in TorchJD.
+    Source: Lopez-Paz and Ranzato 2017; TorchJD uses the name DualProj.
     """
 
     identity_at_one: ClassVar[bool] = True

@@ -1,4 +1,4 @@
-"""Confidence-gated projection (arXiv 2605.00052, appendix; all numbers are ours)."""
+"""Confidence-gated projection (arXiv 2605.00052, appendix; crossgrad chose all numeric values)."""
 
 from collections.abc import Mapping
 from statistics import NormalDist
@@ -17,13 +17,14 @@ _THRESHOLDS: Final = {"v2": 0.9, "low": 0.6}
 
 
 class ConfGate(GramianOperator):
-    """Projects a pair only if the pair conflicts now and has probably done so for some time.
+    """Project a pair of views only if it conflicts now and has probably done so for some time.
 
-    The mean mu and the variance v of the block's cosine are exponential averages (bias-corrected)
-    with n_eff = (1 + beta) / (1 - beta) effective samples. P(conflict) = Phi(-mu / sqrt(v / n_eff +
-    1e-12)). The operator is `symmetric` if m < 0 and P >= tau, else `sum`. A pair is not projected
-    in its first `warmup` updates. Pairs with a zero gradient or without a common element (m = 0)
-    are not counted.
+    The mean mu and variance v of the cosine of a pair are bias-corrected exponential averages. The
+    averages correspond to n_eff = (1 + beta) / (1 - beta) samples. The probability of a conflict is
+    P = Phi(-mu / sqrt(v / n_eff + 1e-12)), with the normal distribution function Phi. If the dot
+    product m is negative and P >= tau, the pair is processed as in `symmetric`, otherwise as in
+    `sum`. A pair is not projected during its first `warmup` updates. Steps with m = 0 do not count
+    as updates, for example if the gradients share no non-zero element.
     """
 
     identity_at_one: ClassVar[bool] = True
@@ -39,7 +40,7 @@ class ConfGate(GramianOperator):
     warmup: int = Field(100, ge=0, description="updates of a pair before the pair may be projected")
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """Return the options without an effect; see `HasUnusedOptions`."""
+        """Return the options that have no effect (see `HasUnusedOptions`)."""
         return (
             {}
             if self.tau is None

@@ -1,4 +1,4 @@
-"""Operators that minimise over convex combinations of the gradients: MGDA and CAGrad."""
+"""Operators that minimize over convex combinations of the gradients: MGDA and CAGrad."""
 
 from collections.abc import Mapping
 from typing import ClassVar, Literal
@@ -13,11 +13,14 @@ from crossgrad_operators._weights import Flags, Floats, extended_precision
 
 
 class MGDA(Weighting):
-    """The shortest convex combination of the gradients: w minimizes |sum w_k g_k| on the simplex.
+    """The shortest convex combination of the gradients.
 
-    Two views use a closed form. More than two views are solved by the active-set method of Lawson
-    and Hanson. Gradients in float64 use 32 digits. |u| is at most the length of the shortest
-    gradient. The result is zero if a convex combination of the gradients is zero.
+    Weights w >= 0 with sum w = 1 minimize |sum w_k g_k|.
+
+    For two views, a closed form is used. For more views, the active-set method of Lawson and Hanson
+    is used. For float64 gradients, weights are computed with 32 digits. The result is at most as
+    long as the shortest gradient. If some convex combination of the gradients is zero, the result
+    is zero.
 
     Source: Désidéri 2012; Sener and Koltun 2018.
     """
@@ -34,13 +37,15 @@ class MGDA(Weighting):
 
 
 class CAGrad(Weighting):
-    """The direction near the mean that maximizes the smallest decrease of a loss over all views.
+    """The direction near the mean gradient that best decreases every loss.
 
-    max over |d - g_0| <= c |g_0| of min_k g_k.d, g_0 the mean: d = g_0 + (c |g_0| / |g_w|) g_w,
-    where w on the simplex minimises g_w.g_0 + c |g_0| |g_w|. Two views use a closed form. For more
-    views, d is the point nearest to g_0 in the polyhedron in which all views reach a level. The
-    point is found by active sets, with 32 digits for gradients in float64. A single view is not
-    changed.
+    The direction maximizes the smallest decrease over all views.
+
+    With the mean g_0, d maximizes min_k g_k.d subject to |d - g_0| <= c |g_0|. The solution is d =
+    g_0 + (c |g_0| / |g_w|) g_w. Here g_w is the convex combination that minimizes g_w.g_0 + c |g_0|
+    |g_w|. For two views, a closed form is used. For more views, all products g_k.d must reach a
+    common level. d is the point nearest to g_0 in this polyhedron. The nearest point is found by an
+    active-set method, with 32 digits for float64 gradients. A single view is unchanged.
 
     Source: Liu et al. 2021, "Conflict-averse gradient descent for multi-task learning".
     """
@@ -54,7 +59,7 @@ class CAGrad(Weighting):
         return self.c > 0
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """Return the options without an effect; see `HasUnusedOptions`."""
+        """Return the options that have no effect (see `HasUnusedOptions`)."""
         if self.c > 0:
             return {}
         return {"rescale": "it has an effect only if c > 0; leave the option out"}

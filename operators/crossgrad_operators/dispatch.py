@@ -1,4 +1,4 @@
-"""A different operator for each block (arXiv 2605.00052, appendix on operator variants)."""
+"""Use a different operator for each block (arXiv 2605.00052, appendix on operator variants)."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -38,7 +38,7 @@ _OPACITY = frozenset({"opacity", "opacities"})
 
 
 class Rule(BaseModel):
-    """A block, or a kind of blocks, and its operator."""
+    """A rule: the name of a block or of a kind of blocks, and its operator."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -57,10 +57,13 @@ def _as_mapping(rules: tuple[Rule, ...]) -> dict[str, object]:
 
 
 class Dispatch(GramianOperator):
-    """A different operator for each block: from the block's rule, its kind's rule, or the variant.
+    """A different operator for each block.
 
-    Variants of the paper: `geometry-confgate` uses `confgate` for the geometry and `sum` for the
-    appearance. `geometry-projection` projects the geometry and uses `confgate` for the appearance.
+    The operator of a block comes from a rule for the block, from a rule for its kind, or from the
+    variant.
+
+    The paper has two variants: `geometry-confgate` uses `confgate` for geometry and `sum` for
+    appearance. `geometry-projection` uses `symmetric` for geometry and `confgate` for appearance.
     """
 
     variant: Literal["geometry-confgate", "geometry-projection"] = Field(
@@ -98,7 +101,7 @@ class Dispatch(GramianOperator):
         return any(operator.reads_labels() for operator in self._operators().values())
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """Return the options without an effect; see `HasUnusedOptions`."""
+        """Return the options that have no effect (see `HasUnusedOptions`)."""
         given = self._given(selection)
         ruled = {rule.block for rule in self.rules}
         keys = {self._key(name, kind, ruled) for name, kind in given}
@@ -118,7 +121,7 @@ class Dispatch(GramianOperator):
         return {**idle, **inner_idle(selection, "rules", [rule.operator for rule in self.rules])}
 
     def _given(self, selection: Selection) -> list[tuple[str, BlockKind]]:
-        """Return name and kind of the blocks from which each Gramian is computed."""
+        """Return the name and the kind of the blocks for which Gramians exist."""
         blocks = [(block.name, block.kind) for block in selection.backbone.trained_blocks()]
         if self.granularity != "kind":
             return blocks
@@ -143,7 +146,7 @@ class Dispatch(GramianOperator):
             block_matrices, states[key] = transformed(
                 operators[key], gramians[block_indices], of_part, inner, rng
             )
-            # Only the sum of the rows matters here, so move all rows into the first row.
+            # Only the sum of the rows matters, so this sum is stored in the first row.
             if block_matrices.shape[1] != gramians.shape[1]:
                 block_matrices = _in_first_row(block_matrices, gramians.shape[1])
             matrices[block_indices] = block_matrices
@@ -151,7 +154,10 @@ class Dispatch(GramianOperator):
 
     @hookimpl
     def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
-        """Return the objections of all operators, and rules for blocks that do not exist."""
+        """Return the objections of all operators.
+
+        Rules for blocks that do not exist also cause objections.
+        """
         reasons = [
             reason
             for operator in self._operators().values()
@@ -172,7 +178,7 @@ class Dispatch(GramianOperator):
         return reasons
 
     def _operators(self) -> dict[str, MatrixOperator]:
-        """Return the operators by the key of their rule."""
+        """Return all operators by the key of their rule."""
         variants: dict[str, dict[str, MatrixOperator]] = {
             "geometry-confgate": {"geometry": ConfGate(), "appearance": Sum()},
             "geometry-projection": {"geometry": Symmetric(), "appearance": ConfGate()},
@@ -182,7 +188,7 @@ class Dispatch(GramianOperator):
         return chosen | {rule.block: rule.operator for rule in self.rules}
 
     def _served(self, context: OperatorContext) -> NDArray[np.str_]:
-        """Return for each Gramian the key of the rule that applies to it."""
+        """Return the key of the rule that applies to each Gramian."""
         ruled = {rule.block for rule in self.rules}
         kind_of = {
             name: self._key(name, kind, ruled)

@@ -11,11 +11,14 @@ from crossgrad_core.plugin import AggregateContext, AggregateResult, Operator, P
 
 
 class GradDrop(Operator):
-    """A random choice, in every element, between the positive and the negative gradients.
+    """In each element, keep at random either the positive or the negative gradients.
 
-    p is the sum of the positive magnitudes and n the sum of the negative magnitudes. The operator
-    keeps the positive gradients with probability p / (p + n), and otherwise the negative gradients.
-    All views share one uniform random number per element. The expected result is `sum`.
+    The result is the sum of the kept gradients.
+
+    Let p be the sum of the positive values, and n the sum of the magnitudes of the negative values.
+    With probability p / (p + n), the operator keeps the positive gradients, and otherwise the
+    negative gradients. All views share one uniform random number for each element. The expected
+    value of the result is the result of `sum`.
     """
 
     identity_at_one: ClassVar[bool] = True
@@ -46,7 +49,7 @@ class GradDrop(Operator):
 
 
 def _one_sign(views: Sequence[Tensor], generator: torch.Generator) -> Tensor:
-    """Return the sum of either the positive or the negative values, chosen for each element."""
+    """For each element, return the sum of the positive values or the sum of the negative values."""
     first = views[0]
     dtype = torch.promote_types(first.dtype, torch.float32)
     positive = torch.zeros_like(first, dtype=dtype)
@@ -55,6 +58,7 @@ def _one_sign(views: Sequence[Tensor], generator: torch.Generator) -> Tensor:
         positive += gradient.clamp(min=0)
         negative -= gradient.clamp(max=0)
     draws = torch.rand(first.shape, generator=generator, dtype=dtype, device=first.device)
-    # 1 / (1 + n / p) equals p / (p + n), but p + n cannot overflow. For 0 / 0 the result is zero.
+    # 1 / (1 + n / p) equals p / (p + n), but cannot overflow. For 0 / 0, the comparison is False,
+    # and the result is zero.
     keep = draws < 1 / (1 + negative / positive)
     return torch.where(keep, positive, -negative).to(first.dtype)

@@ -1,4 +1,4 @@
-"""GradNorm (Chen et al. 2018), with groups of views in place of tasks."""
+"""GradNorm (Chen et al. 2018), with groups of views instead of tasks."""
 
 from collections.abc import Mapping
 from copy import deepcopy
@@ -22,19 +22,19 @@ from crossgrad_core.plugin import (
 from crossgrad_operators._labels import label_objections, labels_of
 from crossgrad_operators._memory import recall, remember
 
-#: Group -> number, initial value and average of its losses. Losses of scales below full size are
-#: stored for each octave.
+#: Name of a group -> number, initial value and average of the losses of its views. Losses at image
+#: scales below full size are stored separately for each octave of the scale.
 _Losses = dict[str, dict[str, Any]]
 
 
 class GradNorm(GramianOperator):
-    """Weights with which gradient norms follow relative losses: u = sum w_s g_s over groups s.
+    """Weight groups of views such that the gradient norm of each group follows its relative loss.
 
-    The target for G_s = w_s |g_s| is mean(G) (l_s / mean l)^alpha, where l_s is the group's average
-    loss divided by its initial loss. log w_s takes a step of fixed size towards the target. The
-    weights of groups with a gradient are then scaled so that their sum equals their number. There
-    is one weight per block and group, which all views of the group share. Losses are tracked
-    separately for each octave of scale.
+    The target for G_s = w_s |g_s| of group s is mean(G) (l_s / mean l)^alpha. Here l_s is the
+    average loss of the group divided by its initial loss. In each step, log w_s moves by a fixed
+    amount towards the target. The weights are scaled such that their sum over the groups with a
+    gradient equals the number of these groups. Each block and group has one weight, which applies
+    to all views of the group. Losses are stored separately for each octave of the image scale.
     """
 
     identity_at_one: ClassVar[bool] = True
@@ -51,7 +51,7 @@ class GradNorm(GramianOperator):
         return True
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """Return the options without an effect; see `HasUnusedOptions`."""
+        """Return the options that have no effect (see `HasUnusedOptions`)."""
         if self.alpha > 0:
             return {}
         return dict.fromkeys(
@@ -80,13 +80,13 @@ class GradNorm(GramianOperator):
 
     @hookimpl
     def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
-        """Refuse samplers whose views have no labels."""
+        """Return objections to samplers whose views have no labels."""
         return label_objections(selection)
 
     def _followed(
         self, losses: _Losses, labels: tuple[str, ...], context: OperatorContext
     ) -> _Losses:
-        """Return the losses of all groups, updated with the losses of this step."""
+        """Return the stored losses of all groups, updated with the losses of this step."""
         followed = deepcopy(losses)
         scales = context.scales or (1.0,) * len(labels)
         for label, loss, scale in zip(labels, context.losses.tolist(), scales, strict=True):
@@ -98,7 +98,10 @@ class GradNorm(GramianOperator):
         return followed
 
     def _rates(self, losses: _Losses) -> NDArray[np.float64]:
-        """Return the relative losses l_s [S], or 1 until every group has an initial loss."""
+        """Return the relative loss l_s of each of the S groups [S].
+
+        Return only ones until every group has an initial loss.
+        """
         newest = [_at(group, group.get("octave", 0), 0.0) for group in losses.values()]
         have_started = all(s["count"] >= self.baseline and s["start"] > 0 for s in newest)
         if not have_started:
@@ -111,9 +114,9 @@ def _fresh(loss: float) -> dict[str, Any]:
 
 
 def _at(group: dict[str, Any], level: int, loss: float) -> dict[str, Any]:
-    """Return a group's losses at an octave, which becomes the group's newest octave.
+    """Return the stored losses of a group at an octave. Record this octave as the newest octave.
 
-    The losses at full size are stored in the group itself.
+    Losses at full size are stored directly in the entry of the group.
     """
     if level == 0:
         group.pop("octave", None)

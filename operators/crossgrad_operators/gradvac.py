@@ -14,11 +14,14 @@ from crossgrad_operators.projection import random_order
 
 
 class GradVac(GramianOperator):
-    """A sum of gradients, each rotated towards its partners up to their average cosine.
+    """The sum of rotated gradients.
 
-    For each i, for j != i in random order: phi = cos(v, g_j); if phi < t_ij, v gets the multiple of
-    g_j that raises the cosine to t_ij; then t_ij <- (1 - beta) t_ij + beta phi, clipped to +-0.999.
-    The targets start at 0, so the first step follows PCGrad's rule.
+    Each gradient is rotated towards the other gradients, up to the average cosine of the pair.
+
+    For each view i, v starts as g_i. For all j != i in random order, phi = cos(v, g_j). If phi is
+    below the target t_ij, a multiple of g_j is added to v, so that the cosine becomes t_ij. In any
+    case, the target t_ij becomes (1 - beta) t_ij + beta phi, clipped to +-0.999. All targets start
+    at 0, so that the first step equals PCGrad.
     """
 
     identity_at_one: ClassVar[bool] = True

@@ -1,4 +1,4 @@
-"""Magnitude-only distance preconditioner (arXiv 2605.00052, equation preconditioner)."""
+"""Scale gradients by camera distance (arXiv 2605.00052, equation preconditioner)."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,17 +7,17 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import MatrixOperator, OperatorContext, PluginState, diagonals
 
-#: Limits of r / r_ref, so that a camera at the centroid keeps some weight.
+#: Limits of r / r_ref, so that even a camera at the centroid gets some weight.
 _BOUNDS = (1e-2, 1e2)
 
 
 class Preconditioner(MatrixOperator):
-    """Multiplication of each g_k by (r_k / r_ref)^d before the gradients are added.
+    """Multiply each gradient g_k by (r_k / r_ref)^d, then add the gradients.
 
-    r_k is the distance of the camera from the mean training camera, and r_ref is the median of
-    these distances. The ratio is clipped to [1e-2, 1e2]. The exponent depends on the kind of the
-    block. Gradients of far views become longer, and gradients of near views shorter. No Gramian is
-    used.
+    r_k is the distance of the camera from the mean of the training cameras. r_ref is the median of
+    these distances. The ratio r_k / r_ref is clipped to [1e-2, 1e2]. The exponent d depends on the
+    kind of the block. With d > 0, gradients of far views become longer, and gradients of near views
+    become shorter. The operator reads no Gramian.
     """
 
     geometry: float = Field(2.0, description="exponent d for means, scales and rotations")

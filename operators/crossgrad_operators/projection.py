@@ -1,4 +1,4 @@
-"""Operators of pairwise projection: each gradient loses its conflicting components."""
+"""Operators that project pairs of gradients, so that a gradient loses conflicting components."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -10,19 +10,22 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import GramianOperator, OperatorContext, PluginState, Selection
 
-#: If the unit roundoff of the gradients is below this, float64 Gramians are not more precise than
-#: the gradients.
+#: If the unit roundoff of the gradients is below this value, float64 Gramians are not more precise
+#: than the gradients.
 NARROW = 1e-12
 
 
 class Symmetric(GramianOperator):
-    """A sum of gradients: in conflicting pairs, each loses its component along the other gradient.
+    """A sum of projected gradients.
 
-    g_1' = g_1 - (m / |g_2|^2) g_2 and g_2' = g_2 - (m / |g_1|^2) g_1 for m = g_1.g_2 < 0 (paper,
-    equations proj_near, proj_far and final_update): two-task PCGrad. With more than two views,
-    every ordered pair is projected in the order of the slots, always with the original partner.
+    In a conflicting pair, each gradient loses its component along the other gradient.
 
-    This is the primary operator of CrossGrad-GS (arXiv 2605.00052).
+    For m = g_1.g_2 < 0, g_1' = g_1 - (m / |g_2|^2) g_2 and g_2' = g_2 - (m / |g_1|^2) g_1. The
+    equations proj_near, proj_far and final_update of the paper have this form, and equal PCGrad for
+    two tasks. With more than two views, every ordered pair is projected in the order of the views
+    in the step. The other gradient of a pair is always the original gradient.
+
+    The paper CrossGrad-GS (arXiv 2605.00052) uses this operator as its main operator.
     """
 
     identity_at_one: ClassVar[bool] = True
@@ -39,11 +42,11 @@ class Symmetric(GramianOperator):
 
 
 class PCGrad(GramianOperator):
-    """A sum of gradients that lose their components against conflicting partners in random order.
+    """A sum of projected gradients, where conflicts are processed in random order.
 
-    For each i: v = g_i; for j != i in random order: if v.g_j < 0, v -= (v.g_j / |g_j|^2) g_j, with
-    the original g_j; u is the sum of all v. All blocks share one order per step. With two views, no
-    random number is drawn.
+    For each view i, v starts as g_i. For all j != i in random order, if v.g_j < 0, v -= (v.g_j /
+    |g_j|^2) g_j with the original g_j. The result u is the sum of all v. In a step, all blocks use
+    one random order. With two views, no random number is drawn.
 
     Source: Yu et al. 2020, "Gradient surgery for multi-task learning", algorithm 1.
     """
@@ -63,11 +66,12 @@ class PCGrad(GramianOperator):
 
 
 class Soft(GramianOperator):
-    """Remove `strength` times the component along g_j if cos(g_i, g_j) < -threshold.
+    """Remove `strength` times the component along g_j from g_i if cos(g_i, g_j) < -`threshold`.
 
-    v -= strength (v.g_j / |g_j|^2) g_j. Threshold 0 and strength 1 equal `symmetric`, and strength
-    0 equals `sum`. With a threshold above 0 the rule is discontinuous. Pairs are processed in the
-    order of slots.
+    For the present vector v of view i, v -= strength (v.g_j / |g_j|^2) g_j. With threshold 0 and
+    strength 1, the result equals the operator `symmetric`. With strength 0, the result equals the
+    operator `sum`. With a threshold above 0, the result is not continuous in the gradients. Pairs
+    are processed in the order of the views in the step.
     """
 
     identity_at_one: ClassVar[bool] = True
@@ -83,7 +87,7 @@ class Soft(GramianOperator):
         return self.strength > 0
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """Return the options without an effect; see `HasUnusedOptions`."""
+        """Return the options that have no effect (see `HasUnusedOptions`)."""
         if self.strength > 0:
             return {}
         return {"threshold": "strength = 0 removes nothing; leave the option out"}
@@ -107,14 +111,14 @@ class Soft(GramianOperator):
 
 
 def slot_order(views: int) -> NDArray[np.int64]:
-    """Return the partners [K, K] of each view in the order of their slots."""
+    """Return the other views [K, K] of each view, in the order of the views in the step."""
     return np.tile(np.arange(views), (views, 1))
 
 
 def random_order(views: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Return the partners [K, K] of each view in random order.
+    """Return the other views [K, K] of each view, in random order.
 
-    With a single partner, no random number is drawn.
+    With at most two views, no random number is drawn.
     """
     order = slot_order(views)
     return order if views <= 2 else rng.permuted(order, axis=1)  # noqa: PLR2004
@@ -129,15 +133,16 @@ def project(
     threshold: float = 0.0,
     strength: float = 1.0,
 ) -> NDArray[np.float64]:
-    """Return the matrices [B, K, K] that project each gradient against conflicting gradients.
+    """Return the matrices [B, K, K] that project each gradient against its conflicts.
 
     Args:
-        gramians: [B, K, K].
-        context: Gives the views that are present.
-        order: [K, K] order of the partners of each view.
-        gates: [B, K, K] True for pairs that may be projected. By default, all pairs may be
+        gramians: [B, K, K] Gramians.
+        context: The context, which contains the views that are present and the precision of the
+            gradients.
+        order: [K, K] order of the other views for each view.
+        gates: [B, K, K] True for pairs that may be projected. If `gates` is None, all pairs may be
             projected.
-        threshold: Only cosines below minus this value are conflicts.
+        threshold: Only cosines below minus this value count as conflicts.
         strength: Share of the conflicting component that is removed.
     """
     from crossgrad_operators.numba_kernels.projection import projected
@@ -145,8 +150,9 @@ def project(
     if gates is None:
         gates = np.ones(gramians.shape, np.bool_)
     rule = (float(threshold), float(strength))
-    # With two views, each gradient takes one step with the error of one cosine. With more views,
-    # the errors add up. For float32 gradients, they are below the precision of the gradients.
+    # With two views, the error of a projection is the error of a single cosine. With more views,
+    # the errors of several cosines add up. For float32 gradients, the errors of the cosines are
+    # below the precision of the gradients.
     many = gramians.shape[1] > 2  # noqa: PLR2004
     if context.unit < NARROW and many and context.rounding_residuals is not None:
         rest = context.rounding_residuals()

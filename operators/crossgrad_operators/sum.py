@@ -1,4 +1,4 @@
-"""The sum and the mean of the views' gradients."""
+"""Operators that return the sum or the mean of the views' gradients."""
 
 from typing import ClassVar
 
@@ -16,10 +16,10 @@ from crossgrad_core.plugin import (
 
 
 class Sum(MatrixOperator):
-    """u = sum of g_k, equal to one backward pass through the sum of the losses.
+    """The sum of the gradients, equal to a backward pass through the sum of the losses.
 
-    No Gramian and no separate gradients are needed. Separate gradients give the same bits as
-    accumulated gradients.
+    The operator needs neither Gramians nor separate gradients. If separate gradients are available,
+    their sum is bit-identical to accumulated gradients.
     """
 
     separate: ClassVar[bool] = False
@@ -45,11 +45,11 @@ class Sum(MatrixOperator):
 
 
 def divided_sum(context: AggregateContext, divisor: int) -> AggregateResult:
-    """Return the sum of the views' gradients divided by `divisor`, without Gramians.
+    """Return the sum of the views' gradients, divided by `divisor`. No Gramians are computed.
 
-    The counts are numbers of blocks: `zero` counts blocks in which the gradient of a view is
-    exactly zero or absent. `dropped` counts blocks in which the gradient of a view was left out
-    because it is not finite.
+    The counts are numbers of blocks. `zero` counts blocks in which the gradient of a view is zero
+    or missing. `dropped` counts blocks in which the gradient of a view is not finite and was left
+    out.
     """
     gradients = context.gradients
     finite, present = gradients.finite(), gradients.present()
@@ -61,9 +61,10 @@ def divided_sum(context: AggregateContext, divisor: int) -> AggregateResult:
 
 
 class Mean(MatrixOperator):
-    """u = (1/K) sum of g_k, where K counts all views of the step, also views without a gradient.
+    """The mean of the gradients. The divisor K also counts views without a gradient.
 
-    Under Adam it equals `sum` up to the optimizer's eps. No separate gradients are needed.
+    With Adam, the result equals `sum`, except for the effect of eps. The operator does not need
+    separate gradients.
     """
 
     separate: ClassVar[bool] = False

@@ -1,4 +1,4 @@
-"""Any stateless Gramian weighting of TorchJD by name (optional extra `torchjd`)."""
+"""Use a Gramian weighting of TorchJD by name (optional dependency `torchjd`)."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any, TypeAlias
@@ -19,7 +19,7 @@ from crossgrad_core.plugin import (
 _Value: TypeAlias = bool | int | float | str
 
 
-#: TorchJD weightings that do not depend on the Gramian.
+#: TorchJD weightings whose weights do not depend on the Gramian.
 _FIXED = frozenset({"Constant", "Mean", "Random", "Sum"})
 
 
@@ -28,11 +28,11 @@ def _pairs(value: object) -> object:
 
 
 class TorchJD(GramianOperator):
-    """w = Weighting(G / trace G), for the weighting classes of torchjd.aggregation.
+    """Weights w = Weighting(G / trace G), for the weighting classes in torchjd.aggregation.
 
-    G is divided by its trace because TorchJD compares G with absolute thresholds. Views without a
-    gradient are left out of G. Weightings that store earlier steps are refused, because their
-    memory could not be resumed.
+    The Gramian G is divided by its trace, because TorchJD compares G with absolute thresholds.
+    Views without a gradient are left out of G. Weightings that store earlier steps raise an error,
+    because a checkpoint could not save their state.
     """
 
     weighting: str = Field(
@@ -59,7 +59,7 @@ class TorchJD(GramianOperator):
 
         weights = np.zeros(gramians.shape[:2])
         rule = self._built()
-        # TorchJD draws from the global generator, so restore the generator afterwards.
+        # TorchJD uses the global random generator, so restore this generator afterwards.
         with torch.random.fork_rng(devices=[]), torch.no_grad():
             torch.manual_seed(int(rng.integers(2**63)))
             for block, present in enumerate(context.present):

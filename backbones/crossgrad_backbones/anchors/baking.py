@@ -1,4 +1,4 @@
-"""Conversion of neural Gaussians to plain Gaussians by means over cameras."""
+"""Convert neural Gaussians to plain Gaussians by averaging over cameras."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,21 +13,21 @@ from crossgrad_core.numerics.elementwise import sigmoid
 from crossgrad_core.numerics.raster_constants import ALPHA_THRESHOLD, SH_C0
 from crossgrad_core.plugin import Camera, Gaussians
 
-#: Band 1 of the real spherical harmonics: sqrt(3 / (4 pi)).
+#: Factor of the spherical harmonics of degree 1: sqrt(3 / (4 pi)).
 _SH_C1 = sqrt(3.0 / (4.0 * pi))
-#: Regularisation of the coefficients of band 1, as a share of their weight if directions come from
-#: all sides. The regularisation keeps band 1 at 0 if all directions are equal.
+#: Regularization of the coefficients of degree 1, relative to their weight if directions come from
+#: all sides. If all directions are equal, the regularization keeps these coefficients at 0.
 RIDGE = 0.01
 _BASIS = 4
 
 
 @dataclass(frozen=True, eq=False)
 class ColorFit:
-    """Normal equations of the colour fit for P anchors with k slots each.
+    """Normal equations of a least-squares fit of colours, for P anchors with k slots each.
 
     Attributes:
-        products: [P, k, 4, 4] weighted sums of basis times basis.
-        colors: [P, k, 4, 3] weighted sums of basis times (colour - 1/2).
+        products: [P, k, 4, 4] weighted sums of products of two basis functions.
+        colors: [P, k, 4, 3] weighted sums of basis functions times (colour - 1/2).
     """
 
     products: Tensor
@@ -35,18 +35,18 @@ class ColorFit:
 
     @classmethod
     def zeros(cls, like: Tensor) -> "ColorFit":
-        """Make zero sums for tensors [P, k, ...]."""
+        """Create sums of zero for tensors [P, k, ...]."""
         shape = (*like.shape[:2], _BASIS)
         return cls(like.new_zeros(*shape, _BASIS), like.new_zeros(*shape, 3))
 
     def add(self, rows: Tensor, weights: Tensor, directions: Tensor, colors: Tensor) -> None:
-        """Add the colours of anchors `rows` [A], seen along the given directions.
+        """Add the colours of the anchors `rows` [A], seen along `directions`.
 
         Args:
-            rows: [A] int64, without duplicates.
-            weights: [A, k].
-            directions: [A, k, 3] unit vectors from the camera.
-            colors: [A, k, 3] RGB.
+            rows: [A] int64 rows of the anchors, without duplicates.
+            weights: [A, k] weights of the colours.
+            directions: [A, k, 3] unit vectors from the camera to the Gaussians.
+            colors: [A, k, 3] RGB colours.
         """
         x, y, z = directions.unbind(-1)
         ones = torch.full_like(x, SH_C0)
@@ -56,7 +56,12 @@ class ColorFit:
         self.colors[rows] += weighted * (colors[..., None, :] - 0.5)
 
     def solved(self, anchor: Tensor, slot: Tensor) -> Tensor:
-        """Solve for coefficients [G, 4, 3] of the given slots; their weights must not all be 0."""
+        """Return the colour coefficients [G, 4, 3] of G slots.
+
+        The coefficients belong to four basis functions and three channels.
+
+        Each slot needs at least one weight that is not 0.
+        """
         products = self.products[anchor, slot]
         total = products[:, 0, 0] / SH_C0**2
         ridge = torch.diag(products.new_tensor([0.0, 1.0, 1.0, 1.0]))
@@ -65,24 +70,24 @@ class ColorFit:
         return solution
 
 
-#: The mean is taken over at most this many cameras.
+#: Averages are computed over at most this number of cameras.
 BAKED_CAMERAS = 32
 
 
 def evenly(cameras: Sequence[Camera], most: int) -> list[Camera]:
-    """Return at most `most` cameras, evenly spaced in their order."""
+    """Return at most `most` of the cameras, evenly spaced."""
     count = min(len(cameras), most)
     return [cameras[i * len(cameras) // count] for i in range(count)]
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """The appearance of A anchors with k slots each, as seen by one camera.
+    """The appearance of A anchors with k slots each in one camera.
 
     Attributes:
-        opacities: [A, k], 0 if nothing is drawn.
-        covariances: [A, k, 7] scales and unit quaternion.
-        colors: [A, k, 3] RGB.
+        opacities: [A, k] opacities; 0 for slots that are not rendered.
+        covariances: [A, k, 7] scales and unit quaternions.
+        colors: [A, k, 3] RGB colours.
         directions: [A, k, 3] unit vectors from the camera to the Gaussians' centres.
     """
 
@@ -94,13 +99,13 @@ class Look:
 
 @dataclass(frozen=True, eq=False)
 class _Sums:
-    """Sums over cameras, for all P anchors and k slots.
+    """Sums over cameras, for all P anchors with k slots each.
 
     Attributes:
-        cameras: [P, 1] number of cameras that were added.
-        opacities: [P, k].
-        covariances: [P, k, 7], weighted by the opacities.
-        colors: Colours by direction, weighted by the opacities.
+        cameras: [P, 1] number of cameras that were added for each anchor.
+        opacities: [P, k] sums of the opacities.
+        covariances: [P, k, 7] sums of scales and quaternions, weighted by the opacities.
+        colors: Fit of the colours by direction, weighted by the opacities.
     """
 
     cameras: Tensor
@@ -110,7 +115,7 @@ class _Sums:
 
     @classmethod
     def zeros(cls, offsets: Tensor) -> "_Sums":
-        """Make zero sums for offsets [P, k, 3]."""
+        """Create sums of zero for offsets [P, k, 3]."""
         shape = offsets.shape[:2]
         return cls(
             offsets.new_zeros(shape[0], 1),
@@ -120,9 +125,10 @@ class _Sums:
         )
 
     def add(self, rows: Tensor, look: Look) -> None:
-        """Add the appearance of anchors `rows` in one camera."""
+        """Add the appearance of the anchors `rows` in one camera."""
         sums = self.covariances[rows]
-        # A quaternion and its negative describe the same rotation, so give both the same sign.
+        # A quaternion and its negative describe the same rotation. Choose the sign that matches the
+        # sum so far.
         along = (sums[..., 3:] * look.covariances[..., 3:]).sum(-1, keepdim=True)
         look.covariances[..., 3:] *= torch.where(along < 0, -1.0, 1.0)
         self.covariances[rows] = sums + look.opacities[..., None] * look.covariances
@@ -140,20 +146,20 @@ def baked(
 ) -> Gaussians:
     """Convert anchors to plain Gaussians.
 
-    The result for an anchor is the mean over the cameras that see the anchor.
-
-    Opacities are averaged with 0 for cameras that do not draw a Gaussian. Scales, rotations and
-    colours are averaged with the opacities as weights; colours use spherical harmonics up to band
-    1. An anchor that no camera sees is averaged over all cameras.
+    The values of an anchor are averaged over the cameras that see the anchor. In the average of
+    opacities, a camera that does not render a Gaussian counts with 0. Scales, rotations and colours
+    are averaged with the opacities as weights. Colours use spherical harmonics of degree 0 and 1.
+    The values of an anchor that no camera sees are averaged over all cameras.
 
     Args:
-        heads: The networks.
-        parameters: The parameters, as for `decoded`.
-        views: Cameras and the anchors that each camera sees.
-        code: [C] appearance code, or None.
+        heads: The networks of the anchors.
+        parameters: The parameters, as described in `decoded`.
+        views: Cameras, each with the anchors that the camera sees.
+        code: [C] appearance code; None without codes.
 
     Returns:
-        Gaussians of degree 1 with a mean opacity above the alpha threshold, anchor by anchor.
+        Gaussians of degree 1, in the order of their anchors. Gaussians whose mean opacity is below
+        the alpha threshold are left out.
     """
     sums = _Sums.zeros(parameters["offsets"])
     for camera, seen in views:

@@ -1,4 +1,4 @@
-"""Base of the anchor backbones: options, blocks, first values, decoding, regularisation."""
+"""Base class of anchor backbones: options, blocks, initial values, decoding, regularization."""
 
 import math
 from abc import abstractmethod
@@ -30,27 +30,29 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: Near plane and dilation (px^2) of the filter: the defaults of the rasterizers.
+#: Near plane, and dilation in px^2, of the frustum filter. The near plane and the dilation equal
+#: the defaults of the rasterizers.
 NEAR, DILATION = 1e-3, 0.3
-#: At this number of standard deviations, the alpha of an opaque Gaussian falls below the alpha
-#: threshold.
+#: At this number of standard deviations from its centre, the alpha of an opaque Gaussian equals the
+#: alpha threshold.
 REACH = math.sqrt(-2.0 * math.log(ALPHA_THRESHOLD))
-#: Distance of the first pixel's centre from the image border.
+#: Distance of the outermost pixel centres from the image border, in pixels.
 _HALF_PIXEL = 0.5
 
 
 @torch.no_grad()
 def in_frustum(positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
-    """Return a mask [P] of the anchors whose own Gaussian would reach the image.
+    """Return a mask [P] of the anchors whose own Gaussian would be visible in the image.
 
-    An anchor is treated as an opaque, unrotated Gaussian whose scales are the scales of the
-    anchor's offsets. The Gaussian is projected with the rasterizers' formulas. The anchor passes if
-    the bounding box of this Gaussian's footprint (alpha >= 1/255) contains a pixel centre.
+    Each anchor is treated as an opaque, unrotated Gaussian. The scales of this Gaussian are the
+    scales of the anchor's offsets. The Gaussian of an anchor is projected with the formulas of the
+    rasterizers. An anchor is in the frustum if the bounding box of the footprint (alpha >= 1/255)
+    contains a pixel centre.
 
     Args:
-        positions: [P, 3] local units.
-        log_scales: [P, 3] or more columns; the first three are used.
-        camera: The camera.
+        positions: [P, 3] positions in local units.
+        log_scales: [P, 3] or more columns of log scales; the first three columns are used.
+        camera: The camera of the image.
 
     Source: Scaffold-GS, section 3.2 (view-frustum filtering).
     """
@@ -61,7 +63,11 @@ def in_frustum(positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
 
 
 def _axes(camera: Camera) -> list[tuple[float, ...]]:
-    """Return for x and y: focal length, centre, limits of the slope, first and last position."""
+    """Return six values for x and six for y.
+
+    The six values are focal length, principal point, two slope limits, and first and last pixel
+    centre.
+    """
     sizes = ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))
     axes: list[tuple[float, ...]] = []
     for focal, center, size in sizes:
@@ -80,7 +86,7 @@ def _plain(positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
         flat, pose, _axes(camera), strict=False
     ):
         slope = along / depth
-        # The row of the Jacobian in world axes, multiplied by depth / focal.
+        # Row of the Jacobian in world axes, multiplied by depth / focal.
         row = axis[:3] - slope.clamp(least, most)[:, None] * pose[2, :3]
         variance = (row.square() * squares).sum(1) * (focal / depth).square() + DILATION
         extent = REACH * variance.sqrt()
@@ -109,7 +115,7 @@ def _fused(positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
 
 
 def mean_volume(gaussians: Gaussians) -> Tensor:
-    """Return the mean over the Gaussians of the product of their scales; 0 without Gaussians.
+    """Return the mean volume of the Gaussians (the product of their scales); 0 without Gaussians.
 
     Source: Scaffold-GS, section 3.4.
     """
@@ -118,11 +124,11 @@ def mean_volume(gaussians: Gaussians) -> Tensor:
 
 @dataclass(frozen=True)
 class Used:
-    """The anchors that a camera uses.
+    """The anchors that a camera uses, and the factors of their opacities.
 
     Attributes:
-        mask: [P] bool.
-        factor: [P] in [0, 1], factor of the anchors' opacities; None if all factors are 1.
+        mask: [P] bool, True for anchors that the camera uses.
+        factor: [P] factor of each anchor's opacities, in [0, 1]; None if all factors are 1.
     """
 
     mask: Tensor
@@ -130,15 +136,18 @@ class Used:
 
 
 class AnchorBackbone(AnchorOptions):
-    """Anchors with one feature each, which networks decode to k Gaussians per anchor and view.
+    """Anchors with one feature vector each.
 
-    A subclass decides where anchors start and which anchors a camera uses.
+    Networks decode k Gaussians from each anchor for each view.
 
-    Blocks: anchors [P, 3] (frozen); offsets [P, k, 3] in units of exp(scales[:, :3]); features
-    [P, F]; scales [P, 6] (log: stretch of the offsets, then size of the Gaussians); mlp_opacity,
-    mlp_cov, mlp_color and, if enabled, mlp_bank (four tensors each); voxel_size (frozen). The
-    published code also stores a rotation and an opacity of each anchor but never trains them; both
-    are left out. Source: Scaffold-GS (Lu et al. 2024); methods of section 2.
+    A subclass decides where the initial anchors are, and which anchors a camera uses.
+
+    Blocks: `anchors` [P, 3], frozen; `offsets` [P, k, 3] in units of exp(scales[:, :3]); `features`
+    [P, F]; `scales` [P, 6], logarithms of three scales of the offsets and three sizes of Gaussians;
+    `mlp_opacity`, `mlp_cov`, `mlp_color` and, if enabled, `mlp_bank`, with four tensors each;
+    `voxel_size`, frozen. The published code also stores a rotation and an opacity for each anchor,
+    but never trains these two tensors. crossgrad leaves out the rotations and opacities of anchors.
+    Source: Scaffold-GS (Lu et al. 2024).
     """
 
     positions: ClassVar[str] = "anchors"
@@ -151,14 +160,14 @@ class AnchorBackbone(AnchorOptions):
         scene: Scene,
         rng: np.random.Generator,
     ) -> Parameters:
-        """Create the initial values of all blocks of this class.
+        """Create the initial values of all blocks that this class defines.
 
         Args:
-            positions: [P, 3] positions of the anchors, local units.
-            spacing: [P] initial sizes of the anchors, local units.
-            voxel_size: Edge of the finest voxel, local units.
-            scene: The scene, for the appearance codes of its training views.
-            rng: Draws the initial values of the networks and codes.
+            positions: [P, 3] positions of the anchors in local units.
+            spacing: [P] initial sizes of the anchors in local units.
+            voxel_size: Edge of the smallest voxel in local units.
+            scene: The scene, whose training views get appearance codes.
+            rng: Random generator for the initial values of networks and codes.
         """
         count = positions.shape[0]
         scales = torch.from_numpy(np.log(spacing)).float()
@@ -179,10 +188,10 @@ class AnchorBackbone(AnchorOptions):
 
     @override
     def adopt(self, gaussians: Gaussians, scene: Scene, rng: np.random.Generator) -> Parameters:
-        """Create anchors at the Gaussians; only their means are used.
+        """Create anchors at the means of Gaussians. Other properties of the Gaussians are not used.
 
         Raises:
-            UserError: All Gaussians are too faint to be seen.
+            UserError: The opacities of all Gaussians are below the alpha threshold.
         """
         drawn = gaussians.opacities >= ALPHA_THRESHOLD
         if not bool(drawn.any()):
@@ -199,16 +208,18 @@ class AnchorBackbone(AnchorOptions):
 
     @abstractmethod
     def used(self, parameters: Mapping[str, Tensor], camera: Camera, phase: Phase) -> Used | None:
-        """Return the anchors that a camera uses, regardless of its frustum; None for all anchors.
+        """Return the anchors that a camera uses, without a test of its frustum.
+
+        If the result is None, the camera uses all anchors.
 
         Args:
             parameters: The parameters.
             camera: The camera.
-            phase: The phase of training.
+            phase: The phase of training or evaluation.
         """
 
     def seen(self, parameters: Mapping[str, Tensor], camera: Camera, phase: Phase) -> Seen:
-        """Return the anchors that a camera uses and that are in its frustum."""
+        """Return the anchors that a camera uses and that are inside its frustum."""
         mask = in_frustum(parameters["anchors"], parameters["scales"].detach(), camera)
         used = self.used(parameters, camera, phase)
         if used is None:
@@ -241,7 +252,7 @@ class AnchorBackbone(AnchorOptions):
 
     @hookimpl
     def crossgrad_regularize(self, context: RegularizeContext) -> RegularizeResult | None:
-        """Return the mean volume of the Gaussians of a view, times `volume_weight`."""
+        """Return the mean volume of the Gaussians of a view, multiplied by `volume_weight`."""
         if context.gaussians is None or not self.volume_weight:
             return None
         return RegularizeResult(self.volume_weight * mean_volume(context.gaussians))

@@ -1,4 +1,4 @@
-"""Decoding of anchors to the Gaussians of a camera."""
+"""Decode anchors to the Gaussians that a camera sees."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -27,25 +27,25 @@ from crossgrad_core.numerics.jobs import parallel
 from crossgrad_core.plugin import Camera, Gaussians
 
 Gradients: TypeAlias = tuple[Tensor | None, ...]
-#: Indices of the outputs for opacity, covariance and colour, and index of the covariance among
-#: these three.
+#: Indices of the three output networks (opacity, covariance, colour), and index of the covariance
+#: network.
 _HEADS, _COVARIANCE = (0, 1, 2), 1
-#: Index of the scales among means, quaternions, scales, opacities and colours.
+#: Position of the scales in the list of means, quaternions, scales, opacities and colours.
 _SCALES = 2
 
 
 @dataclass(frozen=True, eq=False)
 class _Back:
-    """Gradient sums over the anchors, and buffers for a stretch of anchors.
+    """Sums of gradients over all anchors, and buffers for one stretch (a fixed number of anchors).
 
     Attributes:
-        heads: The heads (opacity, covariance, colour) that receive a gradient; they follow one
-            another without a gap.
-        features: [Q, F] sum.
-        first: Gradient sums of the first layers.
-        second: Gradient sums of the second layers of `heads`, concatenated.
-        raw: [n, outputs of all heads] gradient with respect to the raw outputs.
-        hidden: [n, H of all heads] gradient with respect to the hidden layers.
+        heads: Indices of the output networks that receive a gradient. The indices of these heads
+            are consecutive.
+        features: [Q, F] sum of gradients with respect to the features.
+        first: Sums of gradients with respect to the first layers.
+        second: Sums of gradients with respect to the second layers of `heads`, concatenated.
+        raw: [n, outputs of all heads] gradients with respect to the raw outputs of n anchors.
+        hidden: [n, H of all heads] gradients with respect to the hidden layers of n anchors.
     """
 
     heads: tuple[int, ...]
@@ -66,7 +66,7 @@ class _Back:
         return cls(heads, torch.zeros_like(inputs.features), first, second, *buffers)
 
     def sweep(self, inputs: Inputs, kept: Kept, fill: Callable[..., None]) -> None:
-        """Process all anchors in stretches; `fill(first, n)` writes `raw` for n anchors."""
+        """Process all anchors in stretches. `fill(first, n)` writes `raw` for n anchors."""
         width, feature = self.second[0].shape[1], inputs.features.shape[1]
         begin = self.heads[0] * width
         mine = slice(begin, begin + self.hidden.shape[1])
@@ -86,7 +86,7 @@ class _Back:
             self.features.index_copy_(0, owners, hidden[:count] @ weight)
 
     def _second(self, inputs: Inputs, hidden: Tensor, raw: Tensor, out: Tensor) -> None:
-        """Compute gradients of the hidden layers [n, H of all heads] and of the second layers."""
+        """Compute the gradients with respect to the hidden layers and the second layers."""
         width, at = self.second[0].shape[1], 0
         for index, head in enumerate(self.heads):
             weight = inputs.second[head][0]
@@ -98,7 +98,10 @@ class _Back:
         self.second[1].add_(raw.sum(0))
 
     def by_second(self, inputs: Inputs) -> list[Tensor | None]:
-        """Return gradients of weight and bias of the three second layers; None for unused heads."""
+        """Return gradients of weights and biases of the three second layers.
+
+        An output network without a gradient gets None.
+        """
         gradients: list[Tensor | None] = [None] * (2 * len(_HEADS))
         sizes = [len(inputs.second[head][1]) for head in self.heads]
         weights, biases = (torch.split(gradient, sizes) for gradient in self.second)
@@ -108,17 +111,19 @@ class _Back:
 
 
 def backward(inputs: Inputs, kept: Kept, given: Gradients) -> Gradients:
-    """Compute the gradients of the inputs of the forward pass.
+    """Compute the gradients with respect to the inputs of the forward pass.
 
     Args:
-        inputs: Inputs of the forward pass.
-        kept: Values that the forward pass saved.
-        given: Gradients of means, quaternions, scales, opacities and colours; None means zero.
+        inputs: The inputs of the forward pass.
+        kept: The values that the forward pass saved.
+        given: Gradients with respect to means, quaternions, scales, opacities and colours; None
+            means zero.
 
     Returns:
-        Gradients of features, offsets, log scales, weight and bias of the first layers, and of each
-        second layer. If only the scales have a gradient (volume regularisation), the gradients of
-        the offsets and of the other two networks are None and are not computed.
+        Gradients with respect to features, offsets, log scales, weight and bias of the first
+        layers, and weight and bias of each second layer. If only the scales have a gradient (volume
+        regularization), the gradients of the offsets, the opacity network and the colour network
+        are None. These gradients are not computed, which saves time.
     """
     alone = all((gradient is not None) == (i == _SCALES) for i, gradient in enumerate(given))
     back = _Back.of(inputs, kept, (_COVARIANCE,) if alone else _HEADS)
@@ -153,7 +158,7 @@ def _filled(given: Gradients, kept: Kept) -> list[NDArray[Any]]:
     ]
 
 
-#: Names of the outputs of `forward`. The first five outputs are differentiable.
+#: Names of the outputs of `forward`. Only the first five outputs are differentiable.
 _OUTPUTS = ("means", "quats", "scales", "opacities", "colors", "origin", "slot")
 _DIFFERENTIABLE = 5
 
@@ -177,12 +182,15 @@ class _Decode(torch.autograd.Function):
 
 
 def gaussians_of(view: View, *tensors: Tensor) -> Gaussians:
-    """Return the Gaussians with positive opacity, differentiable in all tensors.
+    """Return the Gaussians with positive opacity.
+
+    The Gaussians are differentiable with respect to all tensors.
 
     Args:
-        view: The constant part.
-        tensors: Features [Q, F], offsets [P, k, 3], log scales [P, 6], then weight and bias of the
-            first layers and of the second layers of opacity, covariance and colour; float32.
+        view: The constant inputs.
+        tensors: Features [Q, F], offsets [P, k, 3], log scales [P, 6], then weights and biases, all
+            float32. The weights and biases belong to the first layers, and to the second layers of
+            opacity, covariance and colour.
     """
     result = _Decode.apply(view, *tensors)  # type: ignore[no-untyped-call]
     return Gaussians(**dict(zip(_OUTPUTS, result, strict=True)))
@@ -195,19 +203,19 @@ def decoded(
     seen: Seen,
     code: Tensor | None = None,
 ) -> Gaussians:
-    """Decode the given anchors to Gaussians for a camera, differentiable.
+    """Decode the given anchors to Gaussians for a camera. The result is differentiable.
 
     Args:
-        heads: The networks.
-        parameters: `anchors` [P, 3], `offsets` [P, k, 3], `features` [P, F], `scales` [P, 6] (log)
-            and the tensors of the networks.
+        heads: The networks of the anchors.
+        parameters: `anchors` [P, 3], `offsets` [P, k, 3], `features` [P, F], `scales` [P, 6]
+            (logarithms), and the tensors of the networks.
         camera: The camera.
-        seen: The anchors to decode, and the factors of their opacities.
-        code: [C] appearance code, or None.
+        seen: The anchors to decode, with the factors of their opacities.
+        code: [C] appearance code; None without codes.
 
     Returns:
-        Gaussians with `colors`, `origin`, `slot` and `decoded`, without the Gaussians whose opacity
-        is not positive.
+        Gaussians with `colors`, `origin`, `slot` and `decoded`. Gaussians whose opacity is not
+        positive are left out.
     """
     positions = parameters["anchors"]
     eye = camera.center.to(positions, non_blocking=True)
@@ -219,7 +227,10 @@ def decoded(
 
 
 def _fusible(parameters: Mapping[str, Tensor]) -> bool:
-    """Return True if fused decoding is possible: float32 on the CPU, and fixed anchors."""
+    """Return True if fused decoding is possible.
+
+    Fused decoding requires float32 on the CPU and fixed anchors.
+    """
     names = ("anchors", "offsets", "features", "scales")
     tensors = [parameters[name] for name in names]
     plain = all(tensor.device.type == "cpu" and tensor.dtype == torch.float32 for tensor in tensors)

@@ -1,6 +1,6 @@
-"""Networks and activations of the anchors in one differentiable step.
+"""Compute the networks and activations of the anchors in one differentiable function.
 
-This step requires float32 on a CPU.
+The function requires float32 on a CPU.
 """
 
 from collections.abc import Sequence
@@ -18,8 +18,8 @@ from crossgrad_backbones.anchors.numba_kernels import networks as layers
 from crossgrad_core.numerics.elementwise import sigmoid_
 from crossgrad_core.numerics.jobs import parallel
 
-#: Number of anchors in a stretch, which is a multiple of PANEL. The number is fixed, so that sums
-#: do not depend on the machine.
+#: Number of anchors in a stretch; a multiple of `PANEL`. The number is fixed, so that sums do not
+#: depend on the number of threads.
 STRETCH = 2048
 #: Weight and bias of a linear layer.
 Layer = tuple[Tensor, Tensor]
@@ -27,14 +27,14 @@ Layer = tuple[Tensor, Tensor]
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Constants of the decoding for one view that sees A of P anchors.
+    """Constant inputs for the decoding of one view that sees A of P anchors.
 
     Attributes:
-        positions: [P, 3].
-        rows: [A] int64, the anchors that are seen, without duplicates.
-        factor: [A] factor of the anchors' opacities; None if all factors are 1.
-        views: [A, V] direction (and distance) from the camera.
-        feature_rows: [A] int64, the row of each anchor's feature, without duplicates.
+        positions: [P, 3] positions of all anchors.
+        rows: [A] int64 rows of the anchors that the view sees, without duplicates.
+        factor: [A] factor of each anchor's opacities; None if all factors are 1.
+        views: [A, V] direction from the camera and, if used, distance.
+        feature_rows: [A] int64 row of each anchor's feature, without duplicates.
     """
 
     positions: Tensor
@@ -46,15 +46,15 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """A view and the differentiable inputs; H is the width of a hidden layer.
+    """All inputs of the decoding; H is the width of a hidden layer.
 
     Attributes:
-        view: The constant part.
-        features: [Q, F].
-        offsets: [P, k, 3].
-        log_scales: [P, 6].
-        first: [3 H, F + V] the first layers, concatenated.
-        second: The second layers of opacity, covariance and colour.
+        view: The constant inputs.
+        features: [Q, F] feature vectors.
+        offsets: [P, k, 3] offsets of all anchors.
+        log_scales: [P, 6] log scales of all anchors.
+        first: [3 H, F + V] first layers of the three networks, concatenated.
+        second: Second layers of opacity, covariance and colour.
     """
 
     view: View
@@ -66,7 +66,10 @@ class Inputs:
 
     @classmethod
     def of(cls, view: View, tensors: Sequence[Tensor]) -> "Inputs":
-        """Make inputs from a view and all tensors in attribute order, weights before biases."""
+        """Create the inputs from a view and all tensors.
+
+        The tensors have the order of the attributes, and weights precede biases.
+        """
         features, offsets, log_scales, *layers = tensors
         first, *second = zip(layers[::2], layers[1::2], strict=True)
         opacity, covariance, color = second
@@ -75,17 +78,19 @@ class Inputs:
 
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """Values that the backward pass needs in addition to the inputs; G Gaussians are drawn.
+    """Values that the forward pass saves for the backward pass.
+
+    G is the number of rendered Gaussians.
 
     Attributes:
-        joined: [A or more, F + V] inputs of the networks, padded with rows of 0.
-        hidden: [A or more, 3 H] rectified hidden layers.
-        tanhs: [A, k] opacities before the factor.
+        joined: [A or more, F + V] inputs of the networks, padded with rows of zeros.
+        hidden: [A or more, 3 H] hidden layers after the ReLU.
+        tanhs: [A, k] opacities before multiplication by the factor.
         spreads: [A, 6] exponentials of the log scales.
-        starts: [A + 1] first Gaussian of each anchor.
-        slot: [G].
-        shares: [G, 3] scales divided by the anchor's size.
-        colors: [G, 3].
+        starts: [A + 1] index of the first Gaussian of each anchor.
+        slot: [G] slot of each Gaussian.
+        shares: [G, 3] scales divided by the size of the anchor.
+        colors: [G, 3] colours.
     """
 
     joined: Tensor
@@ -99,10 +104,11 @@ class Kept:
 
 
 def forward(inputs: Inputs) -> tuple[tuple[Tensor, ...], Kept]:
-    """Compute the G Gaussians of positive opacity, and the values for the backward pass.
+    """Compute the G Gaussians with positive opacity, and the values for the backward pass.
 
     Returns:
-        Means, quaternions, scales, opacities, colours, origin [G] and slot [G].
+        Means, quaternions, scales, opacities, colours, origin [G] and slot [G], and the values for
+        the backward pass.
     """
     joined, hidden = _hidden(inputs)
     weight, bias = inputs.second[0]
@@ -119,8 +125,8 @@ def forward(inputs: Inputs) -> tuple[tuple[Tensor, ...], Kept]:
     read = (opacities, inputs.view.positions, inputs.offsets, spreads, inputs.view.rows)
     written = (origin, slot, means, quats, shares, scales, kept, colors)
     _fill(inputs, hidden, (*map(array, read), starts, *map(array, written)))
-    # Apply the sigmoid here, because torch's sigmoid is vectorised. The kernel wrote values before
-    # the sigmoid, and the anchor's size into `scales`.
+    # Apply the sigmoid here, because torch's sigmoid is vectorised. Before this line, `shares` and
+    # `colors` contain values before the sigmoid, and `scales` contains the size of the anchor.
     scales.mul_(sigmoid_(shares))
     sigmoid_(colors)
     remembered = (array(spreads), starts, array(slot), array(shares), array(colors))
@@ -129,18 +135,24 @@ def forward(inputs: Inputs) -> tuple[tuple[Tensor, ...], Kept]:
 
 
 def stretches(anchors: int) -> list[slice]:
-    """Split the anchors into stretches of fixed length."""
+    """Split the anchors into stretches of `STRETCH` anchors."""
     return [slice(i, min(i + STRETCH, anchors)) for i in range(0, anchors, STRETCH)]
 
 
 def array(tensor: Tensor) -> NDArray[Any]:
-    """Return the tensor without its graph as a C-order array; copies only if needed."""
+    """Return the tensor as a C-order array without its autograd graph.
+
+    Data are copied only if needed.
+    """
     numbers: NDArray[Any] = tensor.detach().contiguous().numpy()
     return numbers
 
 
 def _hidden(inputs: Inputs) -> tuple[Tensor, Tensor]:
-    """Compute inputs and rectified hidden layers; zero rows pad them to a multiple of `PANEL`."""
+    """Return the inputs and hidden layers of the networks.
+
+    Rows of zeros pad the inputs and the hidden layers to a multiple of `PANEL` rows.
+    """
     weight, bias = inputs.first
     anchors = len(inputs.view.rows)
     joined = torch.empty(anchors + -anchors % PANEL, weight.shape[1])
@@ -153,7 +165,7 @@ def _hidden(inputs: Inputs) -> tuple[Tensor, Tensor]:
 
 
 def _fill(inputs: Inputs, hidden: Tensor, arrays: tuple[NDArray[Any], ...]) -> None:
-    """Run the second layers of covariance and colour, and write the drawn Gaussians."""
+    """Compute the second layers of covariance and colour, and write the rendered Gaussians."""
     (_, (cov, cov_bias), (color, color_bias)) = inputs.second
     width = cov.shape[1]
     for stretch in stretches(len(inputs.view.rows)):

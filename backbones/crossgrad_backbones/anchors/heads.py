@@ -1,4 +1,4 @@
-"""The networks that compute the Gaussians of the anchors in view, in plain torch."""
+"""The networks that compute the Gaussians of visible anchors, in plain torch."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,29 +17,29 @@ from typing_extensions import override
 from crossgrad_core.numerics.elementwise import sigmoid
 from crossgrad_core.plugin import Block, BlockKind, Gaussians, LearningRate, Parameters
 
-#: Number of values of the direction from the camera to the anchor.
+#: Number of values of the direction from the camera to an anchor.
 DIRECTION = 3
-#: Indices of the two linear layers. The ReLU between them has index 1.
+#: Indices of the two linear layers in a network. The ReLU between the linear layers has index 1.
 LAYERS = (0, 2)
-#: Strides with which the feature bank reads the feature, from coarse to fine.
+#: Strides with which the feature bank reads the feature vector, from coarse to fine.
 BANK_STRIDES = (4, 2, 1)
-#: Number of covariance values per Gaussian: three for the scales, and four for the quaternion wxyz.
+#: Number of covariance values for each Gaussian: three scales, and a quaternion (w, x, y, z).
 COVARIANCE = 7
 _CHANNELS = 3
-#: Number of rows that are summed at once.
+#: Number of rows that are summed together.
 PANEL = 256
 
 
 @dataclass(frozen=True)
 class Network:
-    """A perceptron with one hidden layer and ReLU: Linear, ReLU, Linear.
+    """A network with one hidden layer: linear, ReLU, linear.
 
     Attributes:
-        name: Name of the network's block; its tensors are `name.0.weight` [hidden, inputs],
-            `name.0.bias`, `name.2.weight` [outputs, hidden] and `name.2.bias`.
-        inputs: Width of the input.
+        name: Name of the network and of its block. The tensors are `name.0.weight` [hidden,
+            inputs], `name.0.bias`, `name.2.weight` [outputs, hidden] and `name.2.bias`.
+        inputs: Number of inputs.
         hidden: Width of the hidden layer.
-        outputs: Width of the output.
+        outputs: Number of outputs.
     """
 
     name: str
@@ -57,7 +57,10 @@ class Network:
         return Block(self.name, self.tensors, per_primitive=False, kind=kind, lr=lr)
 
     def created(self, rng: np.random.Generator) -> Parameters:
-        """Draw initial values like `torch.nn.Linear`: uniform in +-1 / sqrt(inputs of a layer)."""
+        """Draw initial values as `torch.nn.Linear` does.
+
+        The initial values are uniform in +-1 / sqrt(inputs of the layer).
+        """
         tensors: Parameters = {}
         widths = ((self.inputs, self.hidden), (self.hidden, self.outputs))
         for layer, (width, out) in zip(LAYERS, widths, strict=True):
@@ -68,19 +71,20 @@ class Network:
         return tensors
 
     def layers(self, parameters: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return weight and bias of the first layer, then of the second layer."""
+        """Return weight and bias of the first layer, then weight and bias of the second layer."""
         first, first_bias, second, second_bias = (parameters[name] for name in self.tensors)
         return first, first_bias, second, second_bias
 
 
 @dataclass(frozen=True)
 class Raw:
-    """Outputs of the networks for A anchors of k Gaussians each, before their activations.
+    """Raw outputs of the networks for A anchors with k Gaussians each, before the activations.
 
     Attributes:
-        opacities: [A, k].
-        covariances: [A, 7 k], per Gaussian 3 scales and a quaternion wxyz.
-        colors: [A, 3 k].
+        opacities: [A, k] raw opacities.
+        covariances: [A, 7 k] raw values: three scales and a quaternion (w, x, y, z) for each
+            Gaussian.
+        colors: [A, 3 k] raw colours.
     """
 
     opacities: Tensor
@@ -90,14 +94,14 @@ class Raw:
 
 @dataclass(frozen=True)
 class Heads:
-    """The networks that compute an anchor's Gaussians from its feature and the viewing direction.
+    """The networks that compute an anchor's Gaussians from its feature vector and the direction.
 
     Attributes:
-        offsets: k, Gaussians of an anchor.
-        feature: Width F of the feature and of the hidden layers.
-        far: For opacity, covariance and colour: True if the network also uses the distance.
-        code: Width of the appearance code, which the colour network also uses; 0 without a code.
-        banked: True if a feature bank mixes the feature at three strides by direction and distance.
+        offsets: Number k of Gaussians of each anchor.
+        feature: Width F of the feature vectors and of the hidden layers.
+        far: For opacity, covariance and colour: True if the network also receives the distance.
+        code: Width of the appearance code that the colour network receives; 0 without a code.
+        banked: True if a feature bank mixes the feature vector at three strides.
     """
 
     offsets: int
@@ -108,7 +112,7 @@ class Heads:
 
     @cached_property
     def networks(self) -> tuple[Network, ...]:
-        """The networks of opacity, covariance, colour and (if enabled) the feature bank."""
+        """The networks for opacity, covariance, colour and, if enabled, the feature bank."""
         outputs = (self.offsets, COVARIANCE * self.offsets, _CHANNELS * self.offsets)
         codes = (0, 0, self.code)
         three = tuple(
@@ -123,16 +127,16 @@ class Heads:
     def views(self, offset: Tensor) -> Tensor:
         """Return direction and distance [A, 4] of anchors at `offset` [A, 3] from the camera."""
         distance = torch.linalg.vector_norm(offset, dim=1, keepdim=True)
-        # Avoid a division by zero: an anchor exactly at the camera centre has no direction.
+        # Avoid a division by zero if an anchor is exactly at the camera centre.
         direction = offset / distance.clamp(min=torch.finfo(offset.dtype).tiny)
         return torch.cat([direction, distance], 1)
 
     def inputs(self, views: Tensor) -> Tensor:
-        """Return the part [A, 3 or 4] of `views` that the three networks use with the feature."""
+        """Return the columns [A, 3 or 4] of `views` that the three networks receive."""
         return views if any(self.far) else views[:, :DIRECTION]
 
     def mixed(self, parameters: Mapping[str, Tensor], features: Tensor, views: Tensor) -> Tensor:
-        """Mix the features [A, F], read at strides 4, 2 and 1 and repeated to F."""
+        """Mix the feature vectors [A, F], read at strides 4, 2 and 1 and repeated to width F."""
         first, first_bias, second, second_bias = self.networks[-1].layers(parameters)
         hidden = linear(views, first, first_bias).relu()
         shares = torch.softmax(linear(hidden, second, second_bias), 1)
@@ -143,12 +147,12 @@ class Heads:
     def first_layers(
         self, parameters: Mapping[str, Tensor], code: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """Return the first layers, concatenated: weights [3 H, F + 3 or 4] and biases [3 H].
+        """Return the concatenated first layers: weights [3 H, F + 3 or 4] and biases [3 H].
 
         Args:
             parameters: The parameters.
-            code: [C] appearance code, or None. The code is the same for all anchors and is added to
-                the bias.
+            code: [C] appearance code; None without codes. The code is equal for all anchors, so
+                that its effect is added to the bias.
         """
         weights, biases = [], []
         for network, far in zip(self.networks[:3], self.far, strict=True):
@@ -163,7 +167,7 @@ class Heads:
         return torch.cat(weights), torch.cat(biases)
 
     def second_layers(self, parameters: Mapping[str, Tensor]) -> list[tuple[Tensor, Tensor]]:
-        """Return weight and bias of the second layers of opacity, covariance and colour."""
+        """Return weight and bias of the second layers for opacity, covariance and colour."""
         layers = [network.layers(parameters) for network in self.networks[:3]]
         return [(weight, bias) for _, _, weight, bias in layers]
 
@@ -174,15 +178,15 @@ class Heads:
         views: Tensor,
         code: Tensor | None = None,
     ) -> Raw:
-        """Evaluate the networks.
+        """Compute the raw outputs of all networks.
 
         Args:
-            parameters: The parameters, with the tensors of all networks.
-            features: [A, F] of the anchors.
-            views: [A, 4] from `views`.
-            code: [C] appearance code; None without a code.
+            parameters: The parameters, including the tensors of all networks.
+            features: [A, F] feature vectors of the anchors.
+            views: [A, 4] directions and distances, from `views`.
+            code: [C] appearance code; None without codes.
 
-        Source: Scaffold-GS, section 3.2; methods of section 2.2.
+        Source: Scaffold-GS, section 3.2.
         """
         if self.banked:
             features = self.mixed(parameters, features, views)
@@ -200,11 +204,11 @@ class Heads:
 
 @dataclass(frozen=True)
 class Seen:
-    """The anchors that are decoded for one view.
+    """The anchors that are decoded for a view.
 
     Attributes:
         rows: [A] int64 rows of the anchors, without duplicates.
-        factor: [A] in [0, 1], factor of the opacities of each anchor; None if all factors are 1.
+        factor: [A] factor of each anchor's opacities, in [0, 1]; None if all factors are 1.
     """
 
     rows: Tensor
@@ -214,23 +218,23 @@ class Seen:
 def activated(
     raw: Raw, positions: Tensor, offsets: Tensor, log_scales: Tensor, seen: Seen
 ) -> Gaussians:
-    """Return the Gaussians with positive opacity, anchor by anchor, slot by slot.
+    """Return the Gaussians with positive opacity, in the order of anchors and slots.
 
-    Gaussian j of anchor a has the mean x_a + offset_aj exp(l1_a), the opacity tanh(raw), the scales
-    exp(l2_a) sigmoid(raw) and the colour sigmoid(raw). Quaternions are not normalised, because no
-    rasterizer depends on their length.
+    Gaussian j of anchor a has the mean x_a + offset_aj exp(l1_a) and the opacity tanh(raw). The
+    scales of Gaussian j are exp(l2_a) sigmoid(raw), and its colour is sigmoid(raw). Quaternions are
+    not normalised, because rasterizers accept any length.
 
     Args:
-        raw: Outputs for A anchors of k Gaussians.
-        positions: [P, 3] of all anchors.
-        offsets: [P, k, 3] of all anchors.
-        log_scales: [P, 6] of all anchors: l1, then l2.
-        seen: The anchors of the outputs.
+        raw: Raw outputs for A anchors with k Gaussians each.
+        positions: [P, 3] positions x of all anchors.
+        offsets: [P, k, 3] offsets of all anchors.
+        log_scales: [P, 6] log scales of all anchors: three columns l1, then three columns l2.
+        seen: The A anchors to which the raw outputs belong.
 
     Returns:
         Gaussians with `colors`, `origin` and `slot`.
 
-    Source: Scaffold-GS, section 3.2; methods of section 2.2.
+    Source: Scaffold-GS, section 3.2.
     """
     opacities = torch.tanh(raw.opacities)  # [A, k]
     if seen.factor is not None:
@@ -253,17 +257,22 @@ def activated(
 
 
 def product(left: Tensor, right: Tensor) -> Tensor:
-    """Return the product [a, b] of left [n, a] transposed and right [n, b]; n % `PANEL` is 0.
+    """Return the product [a, b] of `left` [n, a] transposed and `right` [n, b].
 
-    The sum is computed panel by panel. Matrix libraries split one long sum over all threads, so the
-    rounding of the sum depends on the number of threads.
+    The number n must be a multiple of `PANEL`.
+
+    Each panel of `PANEL` rows is summed separately. A matrix library would split one long sum over
+    all threads. The rounding of such a sum would depend on the number of threads.
     """
     first, second = (torch.unflatten(matrix, 0, (-1, PANEL)) for matrix in (left, right))
     return torch.bmm(first.transpose(1, 2), second).sum(0)
 
 
 def panel_linear(inputs: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """Return inputs [n, a] times weight [b, a] transposed, plus bias [b]; differentiable once."""
+    """Return inputs [n, a] times weight [b, a] transposed, plus bias [b].
+
+    The result is differentiable once.
+    """
     outputs: Tensor = _Linear.apply(inputs, weight, bias)  # type: ignore[no-untyped-call]
     return outputs
 

@@ -1,4 +1,4 @@
-"""Options and blocks of the anchor backbones, and the appearance codes of views."""
+"""Options and blocks of the anchor backbones, and appearance codes of the training views."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -21,13 +21,13 @@ from crossgrad_core.plugin import (
 )
 
 _FROZEN = LearningRate(0.0)
-#: Names of two tensors of the training views: the codes [V, C] and the poses [V, 3, 4] (float64,
+#: Names of two tensors: codes [V, C] of the training views, and their poses [V, 3, 4] (float64,
 #: frozen).
 CODES, POSES = "appearance", "appearance_poses"
 
 
 class AnchorOptions(Backbone):
-    """The published options of Scaffold-GS; methods of section 2.4 and 2.9."""
+    """The options of Scaffold-GS. The default values of the options are the published values."""
 
     default_densifier: ClassVar[str] = "anchor"
 
@@ -89,7 +89,7 @@ class AnchorOptions(Backbone):
     )
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """Return the options without an effect; see `HasUnusedOptions`."""
+        """Return the options that have no effect (see `HasUnusedOptions`)."""
         bank = "there is no feature bank (feature_bank = false); leave the option out"
         codes = "photos have no codes (appearance = 0); leave the option out"
         return {
@@ -99,7 +99,7 @@ class AnchorOptions(Backbone):
 
     @property
     def heads(self) -> Heads:
-        """The networks."""
+        """The networks of the anchors."""
         far = (self.opacity_distance, self.cov_distance, self.color_distance)
         return Heads(self.offsets, self.feature, far, self.appearance, self.feature_bank)
 
@@ -137,27 +137,29 @@ class AnchorOptions(Backbone):
 
 
 def created_codes(scene: Scene, codes: Tensor) -> Parameters:
-    """Return the appearance tensors: the codes of the training views and their poses.
+    """Return the appearance tensors: codes and poses of the training views.
 
     Args:
-        scene: The scene.
-        codes: [V, C].
+        scene: The scene with the training views.
+        codes: [V, C] initial codes.
     """
     poses = [view.camera.world_to_camera[:3] for view in scene.train_views]
     return {CODES: codes, POSES: torch.stack(poses).double()}
 
 
 def code_of(codes: Tensor, poses: Tensor, camera: Camera, *, training: bool) -> Tensor:
-    """Return the code [C] of a training view during training, else the mean code.
+    """Return the code [C] of a training view during training. In evaluations, return the mean code.
 
-    Scaffold-GS evaluates a held-out view with the code of the training view of the same index.
-    The two views have nothing in common, so this implementation uses the mean code instead.
+    Scaffold-GS evaluates a held-out view with the code of the training view that has the same
+    index. The held-out view and this training view are unrelated. crossgrad evaluates a held-out
+    view with the mean code instead.
 
     Args:
-        codes: [V, C].
-        poses: [V, 3, 4] world to camera.
-        camera: The camera; cameras with the same pose share the first code.
-        training: True if the view is trained on.
+        codes: [V, C] codes of the training views.
+        poses: [V, 3, 4] world-to-camera poses of the training views.
+        camera: The camera. If several training views have the pose of the camera, the first of
+            these views is used.
+        training: True if the view is used for training.
     """
     if training:
         pose = camera.world_to_camera[:3].to(poses, non_blocking=True)

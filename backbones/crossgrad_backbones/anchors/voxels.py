@@ -1,31 +1,32 @@
-"""Grid cells: anchors by voxel rounding, automatic voxel size, and free cells."""
+"""Cells of a grid: anchors at rounded positions, automatic voxel size, and empty cells."""
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-#: Smallest automatic voxel size, in local units, for a cloud of identical points.
+#: Smallest automatic voxel size, in local units; used if all points are equal.
 SMALLEST_VOXEL = 1e-5
-#: Automatic voxel size of a cloud without neighbours, in local units.
+#: Automatic voxel size of a cloud with a single point, in local units.
 LONE_VOXEL = 0.01
-#: Automatic voxel size, in units of the median distance between neighbours. With a value of 1,
-#: nearly every point would get its own anchor. An anchor has ten Gaussians, but vanilla has one
-#: Gaussian per point.
+#: Automatic voxel size, relative to the median distance between neighbouring points. With a factor
+#: of 1, nearly every point would become an anchor. Nearly every point as an anchor would give too
+#: many Gaussians: an anchor has ten Gaussians, but `vanilla` has one Gaussian per point.
 SPACING = 2.0
-#: Cells that are farther from the origin than this are left out, because their integer coordinates
-#: would not be exact.
+#: Cells at least this number of cells from the origin are left out, because their integer
+#: coordinates would not be exact.
 FARTHEST = 2**40
 
 
 def automatic_voxel_size(points: NDArray[np.float64]) -> float:
-    """Return twice the median distance of the points to their nearest neighbour, local units.
+    """Return twice the median distance from a point to its nearest neighbour, in local units.
 
-    Scaffold-GS uses the median of the mean *squared* distance to three neighbours as a length. This
-    value depends on the unit of the input, so it is not reproduced here.
+    Scaffold-GS instead takes the median of the mean *squared* distance to three neighbours as a
+    length. The median of squared distances depends on the unit of the input, so this length is not
+    used here.
 
     Args:
-        points: [N, 3].
+        points: [N, 3] points in local units.
     """
     from scipy.spatial import cKDTree
 
@@ -36,12 +37,12 @@ def automatic_voxel_size(points: NDArray[np.float64]) -> float:
 
 
 def voxel_centers(points: NDArray[np.float64], size: float) -> NDArray[np.float64]:
-    """Return the centres [P, 3] of the voxels that contain points, in lexicographic order.
+    """Return the centres [P, 3] of all voxels that contain points, sorted by coordinates.
 
-    Source: Scaffold-GS, section 3.1: unique(round(p / v)) v.
+    Source: Scaffold-GS, section 3.1: unique(round(p / v)) v, for points p and voxel size v.
 
     Args:
-        points: [N, 3].
+        points: [N, 3] points.
         size: Edge of a voxel, in the unit of the points.
     """
     cells = np.unique(np.round(points / size), axis=0)
@@ -49,9 +50,12 @@ def voxel_centers(points: NDArray[np.float64], size: float) -> NDArray[np.float6
 
 
 def cells_of(positions: Tensor, size: float) -> Tensor:
-    """Return the cell [N, 3] int64 of each position [N, 3]; halfway positions go to the even cell.
+    """Return the cell [N, 3] int64 of each position [N, 3].
 
-    Positions beyond `FARTHEST` cells and non-finite positions are moved to cell `FARTHEST`.
+    Positions halfway between two cells get the even cell.
+
+    Positions beyond `FARTHEST` cells, and positions that are not finite, are moved to cell
+    `FARTHEST`.
     """
     cells = (positions.double() / size).round()
     return cells.nan_to_num(FARTHEST, FARTHEST, -FARTHEST).clamp(-FARTHEST, FARTHEST).long()
@@ -63,10 +67,10 @@ def in_reach(cells: Tensor) -> Tensor:
 
 
 def numbered(cells: Tensor) -> Tensor:
-    """Return numbers [N] int64 that are equal if and only if the cells [N, 3] are equal.
+    """Return numbers [N] int64 that are equal exactly if the cells [N, 3] are equal.
 
-    Columns are numbered one by one so that no product overflows. This is much faster than `unique`
-    of whole rows.
+    The columns are processed one after another, so that no product overflows. Numbering the columns
+    is much faster than `unique` for complete rows.
     """
     number = cells.new_zeros(cells.shape[0])
     for column in cells.unbind(1):
@@ -76,15 +80,18 @@ def numbered(cells: Tensor) -> Tensor:
 
 
 def free_cells(wanted: Tensor, taken: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the distinct free cells among the wanted cells, and the index of each wanted cell.
+    """Return the distinct empty cells among the wanted cells.
+
+    Also return, for each wanted cell, its position in the list of empty cells.
 
     Args:
-        wanted: [N, 3] int64.
-        taken: [M, 3] int64.
+        wanted: [N, 3] int64 wanted cells.
+        taken: [M, 3] int64 cells that are not empty.
 
     Returns:
-        [C] int64 row in `wanted` of the first request for each free cell, in the order of
-        `numbered`; [N] int64 index of each wanted cell in that list, -1 if the cell is taken.
+        [C] int64: for each distinct empty cell, the first row in `wanted`, sorted by the numbers
+        from `numbered`. [N] int64: for each wanted cell, its position in the list of empty cells;
+        -1 if the cell is taken.
     """
     number = numbered(torch.cat([wanted, taken]))
     count = int(number.max()) + 1 if len(number) else 0

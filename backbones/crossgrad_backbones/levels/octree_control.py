@@ -1,4 +1,4 @@
-"""Growing and pruning of anchors by level of detail (Octree-GS, Ren et al. 2024)."""
+"""Grow and prune anchors on several levels of detail (Octree-GS, Ren et al. 2024)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -23,30 +23,30 @@ from crossgrad_core.plugin import SHORTEST_ANCHOR_INTERVAL, DensifyContext, Para
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Gradients that trigger growth, level by level.
+    """The gradient thresholds of all levels.
 
     Attributes:
-        base: Least gradient that grows at level 0, NDC norm.
-        ratio: Factor from one level to the next.
+        base: Smallest gradient norm for which anchors of level 0 request an anchor, in NDC units.
+        ratio: Factor of the threshold from one level to the next.
     """
 
     base: float
     ratio: float
 
     def at(self, levels: Tensor) -> Tensor:
-        """Return the least gradient [A] float64 that grows at levels [A]."""
+        """Return the smallest gradients [A] for which anchors of levels [A] request an anchor."""
         return self.base * self.ratio ** levels.double()
 
 
 @dataclass(frozen=True)
 class Requests:
-    """The cells that N offsets request for new anchors.
+    """The cells in which N offsets request new anchors.
 
     Attributes:
-        sites: [N, 4] int64, level and position in its lattice.
-        anchors: [N] int64, the anchors of the offsets.
+        sites: [N, 4] int64, level of each cell and its position in the lattice.
+        anchors: [N] int64, the anchors to which the offsets belong.
         strength: [N] gradients of the offsets.
-        features: [N, F] features for the new anchor, -inf for none.
+        features: [N, F] feature vectors for the new anchors; -inf without a feature vector.
     """
 
     sites: Tensor
@@ -61,11 +61,11 @@ def requests(
     request: GrowthRequest,
     thresholds: Thresholds,
 ) -> Requests:
-    """Return the cells that the offsets request for new anchors.
+    """Return the cells in which the offsets request new anchors.
 
-    An offset of an anchor of level l requests a cell if its gradient reaches the threshold of level
-    l. The offset requests the cell around its Gaussian: on level l + 1 if that level exists and the
-    gradient reaches the threshold of that level, else on level l.
+    An offset of an anchor at level l requests an anchor if its gradient reaches the threshold of
+    level l. The requested cell contains the Gaussian of the offset. The cell is on level l + 1 if
+    this level exists and the gradient reaches its threshold, else on level l.
     """
     levels = parameters["levels"]
     asks = request.eligible & (request.gradient >= thresholds.at(levels)[:, None])
@@ -86,21 +86,22 @@ def grown(
     thresholds: Thresholds,
     cameras: Tensor,
 ) -> NewAnchors:
-    """Return new anchors in the free cells that offsets request.
+    """Return new anchors in the requested cells that are empty.
 
-    The feature of a new anchor is the elementwise maximum over the requesting anchors of its own
-    level, or 0 without such anchors. Anchors that too few cameras would see are pruned.
+    The feature vector of a new anchor is the elementwise maximum over requesting anchors of the
+    same level. Without such anchors, the feature vector is 0. New anchors whose level too few
+    cameras use are left out.
 
     Args:
-        parameters: Parameters of an octree backbone, detached.
-        request: The requests of the offsets.
-        thresholds: The least gradients for growth.
-        cameras: [C, 3] camera centres, local units.
+        parameters: The parameters of an octree backbone, detached from autograd.
+        request: The requests for new anchors.
+        thresholds: The gradient thresholds of all levels.
+        cameras: [C, 3] camera centres in local units.
 
     Returns:
-        The anchors, with the further tensors `levels` and `extra_levels`.
+        The new anchors, with the additional tensors `levels` and `extra_levels`.
 
-    Source: Octree-GS; methods of section 6.
+    Source: Octree-GS (Ren et al. 2024).
     """
     lattice, levels = Lattice.of(parameters["lattice"]), parameters["levels"]
     asked = requests(parameters, lattice, request, thresholds)
@@ -126,43 +127,47 @@ def grown(
 def seen_from_farther(
     parameters: Mapping[str, Tensor], request: GrowthRequest, thresholds: Thresholds
 ) -> Tensor:
-    """Return a mask [P] of anchors whose eligible offsets have a mean gradient above the threshold.
+    """Return a mask [P] of the anchors whose eligible offsets have a large mean gradient.
 
     Args:
-        parameters: Parameters of an octree backbone, detached.
-        request: The requests of the offsets.
-        thresholds: The thresholds of the mean, one per level.
+        parameters: The parameters of an octree backbone, detached from autograd.
+        request: The requests for new anchors.
+        thresholds: The thresholds of the mean gradient, one for each level.
 
-    Source: Octree-GS; methods of section 6.
+    Source: Octree-GS (Ren et al. 2024).
     """
     count = request.eligible.sum(1)
     mean = (request.gradient * request.eligible).sum(1) / count.clamp(min=1)
     return (count > 0) & (mean >= thresholds.at(parameters["levels"]))
 
 
-#: The published schedule has 40,000 steps. Anchors grow after step 1500 and before step 25,000.
+#: The published schedule has 40,000 steps. Anchors are added every 100 steps after step 1500 and
+#: before step 25,000.
 _LENGTH, _FROM, _UNTIL, _EVERY = 40_000, 1500, 25_000, 100
 
 
 class OctreeControl(AnchorDensifier):
-    """A densifier that adds anchors on the requesting level or, at larger gradients, on the next.
+    """A densifier that adds anchors on the level of the requesting anchor or on the next level.
 
-    Pruning follows Scaffold-GS. No candidate is dropped at random. Anchors whose offsets have large
-    mean gradients are afterwards seen from slightly farther away. Differences from the published
-    code:
+    The next level is used for larger gradients.
 
-    - An offset of the last level adds anchors on that level at any gradient above the level's
-      threshold. The published code adds nothing if the gradient exceeds the threshold of the level
-      after the last.
-    - Each anchor is tested once per edit for its extra level, against the threshold of its own
-      level. The published code tests all anchors against the threshold of every level in turn and
-      adds up the results.
-    - The next level receives anchors even if it is still empty; in the published code an empty
-      level stays empty.
-    - If both levels request a cell in one edit, the cell uses the features of its own level.
+    Anchors are pruned as in Scaffold-GS. No candidate is removed at random. If the offsets of an
+    anchor have a large mean gradient, the anchor is afterwards used from slightly larger distances.
+    Differences from the published code:
 
-    As in the published code, the next level and the extra levels grow from the first edit on. The
-    authors apparently intended to wait until the coarse phase ends.
+    - An offset on the last level requests an anchor on this level for any gradient above the
+      threshold of the level. The published code adds no anchor if the gradient exceeds the
+      threshold of the next level, which does not exist.
+    - In each edit, each anchor is tested once for an extra level, with the threshold of its own
+      level. The published code tests every anchor with the thresholds of all levels, and adds up
+      the results.
+    - Anchors are also added on a level that is still empty. In the published code, an empty level
+      stays empty.
+    - If anchors of two levels request one cell in an edit, the feature vectors come from the level
+      of the cell.
+
+    As in the published code, the next level and the extra levels are used from the first edit on.
+    The authors of the paper probably intended to wait for the end of the coarse phase.
     """
 
     tensors: ClassVar[frozenset[str]] = AnchorDensifier.tensors | {
@@ -177,7 +182,8 @@ class OctreeControl(AnchorDensifier):
     extra_ratio: float = Field(
         0.25,
         ge=0,
-        description="mean gradient above which an anchor gets an extra level, in thresholds",
+        description="an anchor gets an extra level if its mean gradient exceeds this share of the "
+        "threshold",
     )
     extra_level: float = Field(0.01, ge=0, description="amount added to an extra level, levels")
 

@@ -15,8 +15,8 @@ class Observer(Component):
 
     Attributes:
         needs_separate_gradients: True if the observer reads the gradients of single views. The run
-            then stores these gradients separately, which costs memory and changes no bit of the
-            training.
+            then stores these gradients separately, which needs more memory. The training results
+            are the same bit for bit.
     """
 
     slot: ClassVar[str] = "observers"

@@ -1,10 +1,10 @@
-"""Single passes over the float32 gradients of K views: Gramians, weighted sums, overlaps.
+"""Kernels for the float32 gradients of K views: Gramians, weighted sums, overlaps of gradients.
 
-Tensors are passed by address. `addresses` [T, K] int64 contains the address of the first element of
+Gradients are passed by their memory addresses. `addresses` [T, K] int64 contains the address of
 view k's gradient of tensor t, or 0 if the view does not touch the tensor. `sizes` [T] contains the
-numbers of elements. The work is split into chunks of `CHUNK` elements, independent of the number of
-threads, and partial sums are added in the order of the chunks. The same input therefore gives the
-same bits.
+number of elements of each tensor. The work is split into chunks of `CHUNK` elements. Partial sums
+are added in the order of the chunks, for any number of threads. The same gradients therefore give
+bit-identical results with any number of threads.
 """
 
 from typing import Any
@@ -23,16 +23,16 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Rows = NDArray[np.float32]
 
-#: Number of elements of one chunk, which has 64 kB per view. A chunk of sixteen views fits into the
-#: L2 cache.
+#: Number of elements in a chunk. A chunk of one view has 64 kB. The chunks of sixteen views fit
+#: together into the L2 cache.
 CHUNK = 16384
-#: Number of elements of a chunk that a weighted sum processes at a time.
+#: Number of elements for which a weighted sum is computed at a time.
 PIECE = 1024
 
 
 @strict_kernel
 def chunk_table(sizes: Ints) -> Ints:
-    """Return [C, 2], tensor and first element of each chunk."""
+    """Return [C, 2]: for each chunk, its tensor and the position of its first element."""
     total = 0
     for size in sizes:
         total += (size + CHUNK - 1) // CHUNK
@@ -48,14 +48,17 @@ def chunk_table(sizes: Ints) -> Ints:
 
 @strict_device
 def row(address: int, start: int, length: int) -> NDArray[np.float32]:
-    """Return `length` elements from element `start` of the tensor at `address` (in kernels)."""
+    """Return `length` elements of the tensor at `address`, from element `start` on."""
     pointer: Any = float32_pointer(address + 4 * start)  # type: ignore[call-arg]
     return carray(pointer, (length,))
 
 
 @strict_device
 def _many_dots(rows: Ints, count: int, start: int, length: int, out: Floats) -> None:
-    """Compute the Gramian of more than four rows in 2 x 2 tiles; the chunk stays in cache."""
+    """Compute the Gramian of more than four rows in tiles of 2 x 2.
+
+    The data of the chunk stay in the cache.
+    """
     tile = np.empty((2, 2))
     for i in range(0, count, 2):
         i1 = min(i + 1, count - 1)
@@ -73,7 +76,10 @@ def _many_dots(rows: Ints, count: int, start: int, length: int, out: Floats) -> 
 
 @strict_device
 def _chunk_gramian(addresses: Ints, start: int, length: int, compact: Floats, out: Floats) -> None:
-    """Compute the upper triangle of one chunk's Gramian; rows of absent views stay zero."""
+    """Compute the upper triangle of the Gramian of one chunk.
+
+    Entries of views without a gradient stay zero.
+    """
     views = addresses.size
     rows = np.empty(views, np.int64)
     places = np.empty(views, np.int64)
@@ -104,12 +110,14 @@ def _chunk_gramian(addresses: Ints, start: int, length: int, compact: Floats, ou
 
 @strict_kernel
 def summed(partial: Floats, table: Ints, tensors: int) -> Floats:
-    """Return [T, K, K], the sums of the chunks' Gramians (Neumaier compensation), both triangles.
+    """Return [T, K, K], the sums of the chunks' Gramians with Neumaier compensation.
+
+    The sums contain both triangles.
 
     Args:
-        partial: [C, K, K], upper triangles.
-        table: [C, 1 or more], the tensor of each chunk first.
-        tensors: T.
+        partial: [C, K, K] Gramians of the chunks, upper triangles only.
+        table: [C, 1 or more]; the first column contains the tensor of each chunk.
+        tensors: Number of tensors T.
     """
     views = partial.shape[1]
     total = np.zeros((tensors, views, views))
@@ -133,14 +141,16 @@ def summed(partial: Floats, table: Ints, tensors: int) -> Floats:
 
 @strict_kernel
 def gramians(jobs: Jobs, addresses: Ints, sizes: Ints, table: Ints, partial: Floats) -> None:
-    """Write the Gramian of each chunk in one pass; NaN or infinite if a view is not finite.
+    """Write the Gramian of each chunk in one pass.
+
+    Entries of a view with a non-finite gradient are NaN or infinite.
 
     Args:
         jobs: Job counters, passed by `parallel` or `serial`.
-        addresses: [T, K].
-        sizes: [T].
-        table: [C, 2] from `chunk_table`.
-        partial: [C, K, K], zero at first; the input of `summed`.
+        addresses: [T, K] addresses of the gradients.
+        sizes: [T] number of elements of each tensor.
+        table: [C, 2], from `chunk_table`.
+        partial: [C, K, K] output, filled with zeros before the call; `summed` adds these Gramians.
     """
     compact = np.empty(partial.shape[1:])
     chunks = table.shape[0]
@@ -153,7 +163,10 @@ def gramians(jobs: Jobs, addresses: Ints, sizes: Ints, table: Ints, partial: Flo
 
 @strict_device
 def _spread(addresses: Ints, rows: Ints, width: int, start: int, length: int, dense: Rows) -> bool:
-    """Fill `dense` [K * CHUNK] with one chunk of each view; return False if it has no row."""
+    """Fill `dense` [K * CHUNK] with the elements of one chunk for each view.
+
+    Return False if the chunk contains no sparse row.
+    """
     first = np.searchsorted(rows, start // width)
     end = np.searchsorted(rows, (start + length - 1) // width + 1)
     if first == end:
@@ -174,15 +187,17 @@ def _spread(addresses: Ints, rows: Ints, width: int, start: int, length: int, de
 def spread_gramian(
     jobs: Jobs, addresses: Ints, rows: Ints, width: int, size: int, partial: Floats
 ) -> None:
-    """Write the Gramians of gradients that are zero except in some rows, bit-equal to `gramians`.
+    """Write the Gramians of gradients that are zero except in some rows.
+
+    The results are bit-identical to the results of `gramians`.
 
     Args:
         jobs: Job counters, passed by `parallel`.
-        addresses: [K] addresses of the values [R * width]; 0 if a view does not touch the tensor.
-        rows: [R], sorted.
-        width: Elements of a row.
-        size: Elements of the tensor.
-        partial: [C, K, K] for the C chunks of the tensor, zero.
+        addresses: [K] addresses of the values [R * width]; 0 if the view does not touch the tensor.
+        rows: [R] row numbers, sorted.
+        width: Number of elements in a row.
+        size: Number of elements in the tensor.
+        partial: [C, K, K] output for the C chunks of the tensor, filled with zeros before the call.
     """
     views = addresses.size
     dense, compact = np.empty(views * CHUNK, np.float32), np.empty((views, views))
@@ -196,8 +211,8 @@ def spread_gramian(
                 if addresses[k] != 0:
                     places[k] = dense.ctypes.data + 4 * k * CHUNK
             _chunk_gramian(places, 0, length, compact, partial[c])
-            # Numba frees an array after the last line that names it, even if its address is still
-            # used.
+            # Numba frees an array after the last line that names the array. The assignment keeps
+            # `dense` alive while its address is used.
             dense[0] = np.float32(0.0)
         c = next_job(jobs, chunks)
 
@@ -206,9 +221,9 @@ def spread_gramian(
 def _weighted(
     rows: Ints, weights: Floats, count: int, start: int, wide: Floats, narrow: Rows
 ) -> None:
-    """Fill `narrow` with the sum of weights times rows, rounded once.
+    """Fill `narrow` with the weighted sum of rows, which is rounded to float32 once.
 
-    In float64, neither weights nor products overflow or underflow for any ratio of the norms.
+    In float64, the weights and products neither overflow nor underflow.
     """
     n = narrow.size
     a, u = row(rows[0], start, n), weights[0]
@@ -253,7 +268,10 @@ def _divide(a: Rows, divisor: float) -> None:
 
 @strict_device
 def _plain(rows: Ints, count: int, divisor: float, start: int, narrow: Rows) -> None:
-    """Fill `narrow` with the rows added in order in float32 (as in accumulation), then divide."""
+    """Fill `narrow` with the sum of the rows, added in order in float32.
+
+    After the addition, divide the sum by the divisor.
+    """
     n = narrow.size
     a = row(rows[0], start, n)
     if count == 1:
@@ -299,7 +317,7 @@ def _combine_pieces(
     first: int,
     end: int,
 ) -> None:
-    """Compute results in a buffer in fast memory, because the results may overwrite a row."""
+    """Compute the results in a small buffer, because they may overwrite a view's gradient."""
     wide = np.empty(PIECE)
     narrow = np.empty(PIECE, np.float32)
     for start in range(first, end, PIECE):
@@ -331,8 +349,8 @@ def _combine_chunk(
         for i in range(result.size):
             result[i] = 0.0
     elif count == 2 and (out == rows[0] or out == rows[1]):
-        # The most common case has two views, and the result overwrites the gradient of one view.
-        # The order of the two summands has no effect.
+        # The most common situation: two views, and the result overwrites the gradient of one view.
+        # The order of two summands does not change the sum.
         this = 0 if out == rows[0] else 1
         a, b = row(out, first, end - first), row(rows[1 - this], first, end - first)
         if plain:
@@ -354,17 +372,18 @@ def combine(
     sizes: Ints,
     table: Ints,
 ) -> None:
-    """Write the weighted sums of all tensors, in one pass over all views.
+    """Write the weighted sums for all tensors, in one pass over the gradients of all views.
 
     Args:
         jobs: Job counters, passed by `parallel` or `serial`.
-        addresses: [T, K]; 0 leaves the view out.
-        weights: [T, K].
-        plain: [T], True to add the rows in float32 in the order of the views instead.
-        divisor: Divisor of plain sums, in float32.
-        out: [T] addresses of the results; a result may overwrite the gradient of a view.
-        sizes: [T].
-        table: From `chunk_table`.
+        addresses: [T, K] addresses of the gradients; 0 leaves a view out.
+        weights: [T, K] weight of each gradient.
+        plain: [T], True for tensors whose gradients are added without weights, in float32 and in
+            the order of the views.
+        divisor: Number by which plain sums are divided, in float32.
+        out: [T] addresses of the results. A result may overwrite the gradient of a view.
+        sizes: [T] number of elements of each tensor.
+        table: [C, 2], from `chunk_table`.
     """
     chunks = table.shape[0]
     c = next_job(jobs, chunks)
@@ -377,7 +396,7 @@ def combine(
 
 @strict_kernel
 def overlapping(a: int, b: int, size: int) -> bool:
-    """Return True if two tensors have a common non-zero element."""
+    """Return True if some element is non-zero in both tensors."""
     x, y = row(a, 0, size), row(b, 0, size)
     for start in range(0, size, CHUNK):
         shared = 0

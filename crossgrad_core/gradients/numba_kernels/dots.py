@@ -1,8 +1,8 @@
-"""Dot products of a few float32 rows in float64, each row read once.
+"""Dot products of a few float32 rows in float64; each row is read only once.
 
-Sums may be reordered within a call, so that they run in vector registers. Products of float32
-numbers are exact in float64, and squares from 1e-90 to 1e77 neither underflow nor overflow in
-float64.
+Within a call, the compiler may reorder sums to use vector registers. Products of float32 numbers
+are exact in float64. Squares of float32 numbers are 0 or lie between 1e-90 and 1e77, so that a
+float64 sum of them neither underflows nor overflows.
 """
 
 import numpy as np
@@ -75,7 +75,7 @@ def dots_4(a: Row, b: Row, c: Row, d: Row, out: Out) -> None:
 
 @sum_device
 def dots_2x2(a: Row, b: Row, c: Row, d: Row, out: Out) -> None:
-    """Compute the dot products of the rows (a, b) with the rows (c, d)."""
+    """Compute the four dot products of row a or b with row c or d."""
     ac = ad = bc = bd = 0.0
     for i in range(a.size):
         x, y, z, w = np.float64(a[i]), np.float64(b[i]), np.float64(c[i]), np.float64(d[i])

@@ -1,4 +1,4 @@
-"""The largest magnitudes in arrays, as their bits (Numba, CPU, float32)."""
+"""The largest magnitude in each array, returned as its bits (Numba, CPU, float32)."""
 
 import numpy as np
 from numba import carray
@@ -8,7 +8,7 @@ from crossgrad_core.gradients.numba_kernels.pointers import float32_pointer
 from crossgrad_core.numerics.jit import kernel
 from crossgrad_core.numerics.jobs import Jobs, next_job
 
-#: Number of elements that a thread processes at a time.
+#: Number of elements in one job of the work queue.
 PART = 2**15
 _ALL_BUT_SIGN = np.uint32(0x7FFFFFFF)
 
@@ -21,17 +21,18 @@ def largest_bits(
     starts: NDArray[np.int64],
     found: NDArray[np.uint32],
 ) -> None:
-    """Write the bits of the largest magnitude in each part of float32 arrays.
+    """Write the bits of the largest magnitude in each part of several float32 arrays.
 
-    Without its sign, a larger number has larger bits; infinity and NaN have the largest bits.
+    If the sign bit is ignored, larger magnitudes have larger bits; infinity and NaN have the
+    largest bits.
 
     Args:
         jobs: Job counters, passed by `parallel`.
         addresses: [T] addresses of float32 arrays.
-        sizes: [T] numbers of elements.
-        starts: [T + 1] index of the first part of each array. A part contains `PART` elements; the
+        sizes: [T] number of elements of each array.
+        starts: [T + 1] number of the first part of each array. A part contains `PART` elements. The
             last part of an array may be shorter.
-        found: [parts] output: the largest bits in each part.
+        found: Output: the largest bits in each part.
     """
     parts = len(found)
     part = next_job(jobs, parts)
@@ -42,8 +43,8 @@ def largest_bits(
         size, first = sizes[tensor], (part - starts[tensor]) * PART
         bits = carray(float32_pointer(addresses[tensor]), size).view(np.uint32)
         part_bits = bits[first : min(size, first + PART)]
-        # Read four streams at a time. The processor then waits less for memory than with one
-        # stream.
+        # Read from four positions at a time. With four positions at a time, the processor waits
+        # less for memory than with one position.
         quarter = len(part_bits) // 4
         p, q = part_bits[:quarter], part_bits[quarter : 2 * quarter]
         r, s = part_bits[2 * quarter : 3 * quarter], part_bits[3 * quarter : 4 * quarter]

@@ -1,4 +1,4 @@
-"""Arrays from addresses, so that one compiled kernel supports any number of tensors."""
+"""Convert addresses to arrays, so that one compiled kernel supports any number of tensors."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from numba.extending import intrinsic
 
 @intrinsic
 def float32_pointer(typing_context: Any, address: Any) -> Any:  # noqa: ANN401, ARG001
-    """Convert an int64 address to a float32 pointer for `numba.carray` (in kernels)."""
+    """Convert an int64 address to a float32 pointer for `numba.carray`, inside kernels."""
     signature = types.CPointer(types.float32)(types.int64)  # type: ignore[no-untyped-call]
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ANN401

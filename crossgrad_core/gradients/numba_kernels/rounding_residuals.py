@@ -1,8 +1,8 @@
-"""Gramians with twice the digits of float64, for operators that sometimes need more digits.
+"""Gramians with twice as many digits as float64, for operators that need more digits.
 
-Products are added one at a time, and the rounding errors of products and sums are added separately
-(Ogita, Rump and Oishi 2005). The results are as exact as with 106-bit arithmetic. The sums are ten
-times as slow as plain sums.
+Products are added one at a time. The rounding errors of products and sums are added separately
+(Ogita, Rump and Oishi 2005). The results are as exact as with 106-bit arithmetic. Sums of this kind
+take ten times as long as plain sums.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 
 @strict_kernel
 def add_products(rows: Floats, high: Floats, low: Floats) -> None:
-    """Add the Gramian of `rows` [K, P] to the upper triangle of high + low, [K, K] each."""
+    """Add the Gramian of `rows` [K, P] to the upper triangle of `high` + `low`, both [K, K]."""
     views, size = rows.shape
     for i in range(views):
         for j in range(i, views):
@@ -30,16 +30,19 @@ def add_products(rows: Floats, high: Floats, low: Floats) -> None:
 
 @strict_kernel
 def add_row_products(rows: Floats, high: Floats, low: Floats) -> None:
-    """Add the Gramians of `rows` [K, N, d], primitive by primitive, to high + low [N, K, K]."""
+    """For each primitive, add the Gramian of `rows` [K, N, d] to `high` + `low`, both [N, K, K]."""
     for n in range(rows.shape[1]):
         add_products(rows[:, n], high[n], low[n])
 
 
 @strict_kernel
 def left_over(high: Floats, low: Floats, gramians: Floats) -> Floats:
-    """Return [B, K, K], high + low - gramians, from the upper triangles of `high` and `low`.
+    """Return [B, K, K]: high + low - gramians.
 
-    Both triangles of `gramians` are used, because matrix products may round them differently.
+    Only the upper triangles of `high` and `low` are used.
+
+    Both triangles of `gramians` are read, because matrix products may round the triangles
+    differently.
     """
     result = np.zeros(gramians.shape)
     blocks, views, _ = gramians.shape

@@ -1,6 +1,7 @@
-"""Row-wise Gramians and weighted sums: one small Gramian per primitive.
+"""Gramians and weighted sums for each row: every primitive has its own small Gramian.
 
-Addresses have the same meaning as in `dense`; row i of a tensor of width d starts at element i * d.
+`addresses` and `sizes` have the meaning that `dense` describes. Row i of a tensor of width d starts
+at element i * d.
 """
 
 import numpy as np
@@ -9,7 +10,7 @@ from crossgrad_core.gradients.numba_kernels.dense import Flags, Floats, Ints, ro
 from crossgrad_core.numerics.jit import strict_device, strict_kernel
 from crossgrad_core.numerics.jobs import Jobs, next_job
 
-#: Number of rows that one task processes.
+#: Number of rows in one job of the work queue.
 ROWS = 2048
 
 
@@ -37,13 +38,13 @@ def _gramian_task(addresses: Ints, widths: Ints, first: int, end: int, out: Floa
 
 @strict_kernel
 def row_gramians(jobs: Jobs, addresses: Ints, widths: Ints, out: Floats) -> None:
-    """Add the Gramians of the rows of a block of T tensors to `out`.
+    """For each row, add the Gramian over the T tensors of a block to `out`.
 
     Args:
         jobs: Job counters, passed by `parallel`.
-        addresses: [T, K]; 0 if a view does not touch the tensor.
-        widths: [T] elements per row.
-        out: [N, K, K] float64, zero at first.
+        addresses: [T, K] addresses of the gradients; 0 if a view does not touch the tensor.
+        widths: [T] number of elements in a row of each tensor.
+        out: [N, K, K] float64 output, filled with zeros before the call.
     """
     count = out.shape[0]
     tasks = (count + ROWS - 1) // ROWS
@@ -74,14 +75,14 @@ def _combine_task(
 
 @strict_kernel
 def row_combine(jobs: Jobs, addresses: Ints, weights: Floats, out: int, width: int) -> None:
-    """Write sum_k weights[i, k] * row i of view k; a weight of 0 leaves the row out.
+    """Write sum_k weights[i, k] * (row i of view k). A weight of 0 leaves a row out.
 
     Args:
         jobs: Job counters, passed by `parallel`.
-        addresses: [K]; 0 leaves the view out.
-        weights: [N, K].
-        out: Address of the result; may be the address of a view's gradient.
-        width: Elements per row.
+        addresses: [K] addresses of the gradients; 0 leaves a view out.
+        weights: [N, K] weight of each row of each view.
+        out: Address of the result, which may be the address of a view's gradient.
+        width: Number of elements in a row.
     """
     count = weights.shape[0]
     tasks = (count + ROWS - 1) // ROWS
@@ -94,7 +95,7 @@ def row_combine(jobs: Jobs, addresses: Ints, weights: Floats, out: int, width: i
 
 @strict_kernel
 def row_overlaps(a: int, b: int, count: int, width: int, out: Flags) -> None:
-    """Set out[i] if the rows i of two tensors have a common non-zero element."""
+    """Set out[i] to True if row i has an element that is non-zero in both tensors."""
     x, y = row(a, 0, count * width), row(b, 0, count * width)
     for i in range(count):
         for j in range(i * width, i * width + width):

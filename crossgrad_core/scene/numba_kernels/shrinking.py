@@ -1,9 +1,9 @@
-"""scikit-image's anti-aliased resize to a smaller size, row by row (Numba, CPU).
+"""Resize images to a smaller size like scikit-image with anti-aliasing, row by row (Numba, CPU).
 
-The resize applies a Gaussian along the columns, then a Gaussian along the rows, then linear
-interpolation, as `transform.resize` does with SciPy. Only rows needed for interpolation are
-filtered, and no float image of the photo's size exists. Every sum uses SciPy's order and SciPy's
-rounding, so that the bits are the same.
+As in `transform.resize`, a Gaussian filter is applied along the columns and then along the rows.
+The result is interpolated linearly. Only the rows that interpolation needs are filtered. A float
+image in the size of the photo is not needed. Every sum uses the order and the rounding of SciPy, so
+that the results are bit-identical.
 """
 
 import numpy as np
@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import strict_device, strict_kernel
 
-#: Number of columns that are filtered at once, so that they stay in the cache of a core.
+#: Number of columns that are filtered at a time. The columns then fit into the cache of a core.
 _BLOCK = 1024
 
 
 @strict_device
 def _mirrored(index: int, length: int) -> int:
-    """Mirror a pixel index beyond the border into the image; the border pixel is not repeated."""
+    """Mirror a pixel index beyond the border into the image. The border pixel is not repeated."""
     if length == 1:
         return 0
     period = 2 * length - 2
@@ -37,7 +37,10 @@ def _add_pair(
 def _filter_columns(
     image: NDArray[np.uint8], y: int, weights: NDArray[np.float64], line: NDArray[np.float64]
 ) -> None:
-    """Filter the image along the columns and write row `y` [W C] to `line`, rounded to float32."""
+    """Filter row `y` of the image along the columns.
+
+    The result in `line` [W C] is rounded to float32.
+    """
     height, width = image.shape
     for left in range(0, width, _BLOCK):
         right = min(left + _BLOCK, width)
@@ -59,14 +62,14 @@ def _filter_row(
     weights: NDArray[np.float64],
     result: NDArray[np.float64],
 ) -> None:
-    """Filter a row [W C] along its length, rounded to float32.
+    """Filter a row [W C] along its length, and round the result to float32.
 
     Args:
-        padded: The row, with (number of weights - 1) extra pixels at each end; this function fills
+        padded: The row, with (number of weights - 1) extra pixels at each end. The function fills
             the extra pixels.
-        channels: C.
-        weights: From the middle outwards.
-        result: [W C].
+        channels: Number of channels C.
+        weights: Weights of the Gaussian filter, from the middle outwards.
+        result: [W C] output.
     """
     border, width = (weights.size - 1) * channels, result.size // channels
     row = padded[border : border + result.size]
@@ -95,7 +98,10 @@ def _filter_row(
 def _columns(
     columns: int, channels: int, width: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Return the left and right neighbour [w C] of each output value, and the left weight."""
+    """Return the left and right neighbour [w C] of each output value.
+
+    The weight of the left neighbour is the third result.
+    """
     left, right = np.empty(columns * channels, np.int64), np.empty(columns * channels, np.int64)
     near = np.empty(columns * channels)
     for column in range(columns):
@@ -128,13 +134,15 @@ def shrink(
     along_rows: NDArray[np.float64],
     small: NDArray[np.uint8],
 ) -> None:
-    """Resize the image to a size that is at most its own, and write it to `small`.
+    """Resize `image` to the size of `small`, and write the result to `small`.
+
+    Neither side may become larger.
 
     Args:
-        image: [H, W C], contiguous.
-        along_columns: [R + 1] weights of the Gaussian along the columns, the middle one first.
-        along_rows: [S + 1] weights of the Gaussian along the rows, the middle one first.
-        small: [h, w, C], h <= H and w <= W.
+        image: [H, W C] image, contiguous.
+        along_columns: [R + 1] weights of the Gaussian along the columns, from the middle outwards.
+        along_rows: [S + 1] weights of the Gaussian along the rows, from the middle outwards.
+        small: [h, w, C] output, h <= H and w <= W.
     """
     rows, columns, channels = small.shape
     height, width = image.shape[0], image.shape[1] // channels
@@ -145,8 +153,8 @@ def shrink(
     filtered = np.empty((2, width * channels))
     held = np.full(2, -1)
     left, right, near = _columns(columns, channels, width)
-    # Buffers for the upper and the lower row times their weights, and for the values interpolated
-    # between their pixels.
+    # Buffers: the upper and the lower row, each multiplied by its weight, and the interpolated
+    # values.
     above, below = np.empty(width * channels), np.empty(width * channels)
     values = np.empty(columns * channels)
     for row in range(rows):

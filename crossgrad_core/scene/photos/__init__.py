@@ -1,1 +1,1 @@
-"""Photos of a scene: found by name, checked by their headers, decoded when they are needed."""
+"""Photos of a scene: matched by name, checked by their headers, and decoded on demand."""

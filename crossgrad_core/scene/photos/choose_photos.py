@@ -1,4 +1,7 @@
-"""The choice of file, size and calibration for every view; only headers are read."""
+"""Choose the file, size and calibration of each view's photo.
+
+Only the headers of files are read.
+"""
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -34,24 +37,24 @@ from crossgrad_core.scene.photos.shapes import check_mask, choose_reduction, is_
 from crossgrad_core.scene.raw import RawScene
 from crossgrad_core.scene.wording import count, name_some
 
-#: A photo with 8, 10, 12 or 14 bits is recognised if its largest value reaches this share of the
-#: range. A darker photo is ambiguous.
+#: Photos in 16-bit files may contain values of fewer bits. Fewer bits are recognised if the largest
+#: value reaches this share of a smaller range. The bit depth of darker photos is ambiguous.
 _REACHED: Final = 0.8
-#: Photos with a larger value than this use all 16 bits.
+#: If the largest value is above this number, the photos use all 16 bits.
 _DARK: Final = WHITES[-2]
-#: Number of photos that are decoded before the largest value is checked.
+#: Number of photos that are decoded before their largest value is checked.
 _AT_ONCE: Final = 8
 
 
 def white_of(deep: Sequence[Path]) -> tuple[int, list[str]]:
-    """Return the white value of all 16-bit photos, and a note if it is not 65535.
+    """Return the value of white in all 16-bit photos. Return a note if this value is not 65535.
 
-    All photos share one value, which depends on the brightest pixel of all photos. Photos stay dark
-    if they use only a small part of the 16-bit range and do not fill the range of a smaller bit
-    depth.
+    All photos share this value, which depends on the brightest pixel in all photos. Photos stay
+    dark if their largest value matches neither the 16-bit range nor a smaller range.
 
     Args:
-        deep: The 16-bit photos. They are decoded until one photo is bright enough for 16 bits.
+        deep: Paths of the 16-bit photos. Photos are decoded until the values of a photo reach the
+            16-bit range.
 
     Raises:
         UserError: A photo is damaged.
@@ -84,11 +87,11 @@ def white_of(deep: Sequence[Path]) -> tuple[int, list[str]]:
 
 @dataclass(frozen=True)
 class ChosenPhotos:
-    """The photos of a scene.
+    """The photos that were chosen for the views of a scene.
 
     Attributes:
-        sources: View name -> how its photo is decoded; views without a photo are left out.
-        pinholes: View name -> calibration of the photo as trained.
+        sources: Name of a view -> how its photo is decoded. Views without a photo are not included.
+        pinholes: Name of a view -> pinhole calibration of the training photo.
         notes: Notes about photos that were left out, undistorted, resized or masked, and about
             unused files.
     """
@@ -100,7 +103,7 @@ class ChosenPhotos:
 
 @dataclass(frozen=True)
 class _Found:
-    """Paths and headers of the photos of one folder, by view name."""
+    """A photo folder, with the paths and headers of its photos by view name."""
 
     folder: PhotoFolder
     paths: Mapping[str, Path]
@@ -108,18 +111,18 @@ class _Found:
 
     @property
     def longest(self) -> int:
-        """Longest side in pixels."""
+        """Longest side of all photos, in pixels."""
         return max(max(header.width, header.height) for header in self.headers.values())
 
 
 def choose_photos(raw: RawScene, options: SceneOptions) -> ChosenPhotos:
-    """Pair views with photos by name and choose the training size of each photo.
+    """Pair views with photos by name, and choose the training size of each photo.
 
     Raises:
-        UserError: No view has a photo, a photo is damaged or does not fit its camera, or the
+        UserError: No view has a photo, a photo is damaged or does not match its camera, or the
             requested mask folder does not exist.
     """
-    # If the photos are in the scene's root folder, its sibling folders do not belong to the scene.
+    # If the photos are in the scene's root folder, neighbouring folders are outside the scene.
     folders = find_photo_folders(raw.images)[: 1 if raw.images == raw.root else None]
     names = sorted(view.name for view in raw.views)
     full = _read_full(folders[0], names)
@@ -137,7 +140,7 @@ def choose_photos(raw: RawScene, options: SceneOptions) -> ChosenPhotos:
         header = header.reduced(reduction)
         width, height, orientation = _fit(view.calibration, header, path)
         fitted = view.calibration.resized(width, height)
-        # Photos of one camera share one undistortion.
+        # Photos with equal calibrations share one undistortion.
         fitted = shared.setdefault(fitted, fitted)
         target = _limit(fitted.pinhole.width, fitted.pinhole.height, options.max_size)
         pinholes[view.name] = fitted.pinhole.resized(*target)
@@ -204,7 +207,8 @@ def _prefer_reduced(
 ) -> tuple[_Found, list[str]]:
     """Choose the largest photo folder within the size limit, or the full-size photos.
 
-    A reduced folder with photos smaller than half the limit would lose too much detail.
+    If the photos of a reduced folder are smaller than half the limit, the full-size photos are
+    used.
     """
     notes: list[str] = []
     if max_size is None or full.longest <= max_size:
@@ -225,10 +229,10 @@ def _prefer_reduced(
 
 
 def _fit(calibration: Calibration, header: PhotoHeader, path: Path) -> tuple[int, int, int]:
-    """Return width, height and EXIF orientation of a photo in the pixels that its pose refers to.
+    """Return width, height and EXIF orientation of a photo in the orientation of its camera.
 
-    COLMAP ignores EXIF rotation. Therefore the stored pixel grid is used, unless only the rotated
-    photo has the shape of the camera.
+    COLMAP ignores the EXIF orientation. The stored orientation is therefore used, unless only the
+    rotated photo has the aspect ratio of the camera.
     """
     width, height = header.width, header.height
     posed = calibration.width, calibration.height
@@ -247,7 +251,7 @@ def _fit(calibration: Calibration, header: PhotoHeader, path: Path) -> tuple[int
 
 
 def _limit(width: int, height: int, max_size: int | None) -> tuple[int, int]:
-    """Return the size with the longest side reduced to the limit."""
+    """Return a size whose longest side is within the limit. The aspect ratio does not change."""
     longest = max(width, height)
     if max_size is None or longest <= max_size:
         return width, height

@@ -1,4 +1,4 @@
-"""Decoding photos and masks to arrays, and resizing them."""
+"""Decode photos and masks to arrays, and resize them."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -21,31 +21,33 @@ Pixels = NDArray[np.uint8]
 RESIZE_FILTER = "scikit-image resize, anti-aliased"
 
 _FULL_8_BIT, FULL_16_BIT = 255, 65535
-#: Value of white in files that store 1, 8, 10, 12, 14 or 16 bits.
+#: Values of white in files with 1, 8, 10, 12, 14 or 16 bits.
 WHITES = (1, _FULL_8_BIT, 1023, 4095, 16383, FULL_16_BIT)
-#: In a black-and-white mask, at most this share of the pixels differs from both black and white by
-#: more than a tenth of the range.
+#: Largest share of grey pixels in a black-and-white mask. A pixel is grey if its difference from
+#: black and its difference from white exceed a tenth of the range.
 _MOST_GREY = 0.05
-#: Number of bytes of a photo that are copied at once, so that they stay in the processor's cache.
+#: Number of bytes of a photo that are copied at a time. The copied bytes then stay in the
+#: processor's cache.
 _BAND = 1 << 19
-#: SciPy cuts its Gaussian filter off at this many standard deviations.
+#: SciPy truncates its Gaussian filter at this number of standard deviations.
 _WIDTHS = 4.0
 
 
 def decode_photo(
     path: Path, reduction: int = 1, white: int = FULL_16_BIT
 ) -> tuple[Pixels, Pixels | None]:
-    """Decode a photo to RGB [H, W, 3], and its alpha channel [H, W] if it has one.
+    """Decode a photo to RGB [H, W, 3], and to its alpha channel [H, W] if the photo has one.
 
-    Grey, palette, CMYK and 16-bit photos become 8-bit RGB. EXIF rotation is not applied.
+    Photos in grey, palette colours, CMYK or 16 bits are converted to 8-bit RGB. The EXIF
+    orientation is not applied.
 
     Args:
-        path: The file.
-        reduction: 2, 4 or 8 decode a JPEG file with both sides divided by this number.
-        white: The value of white in a photo of 16 bits.
+        path: Path of the photo.
+        reduction: 2, 4 or 8 to decode a JPEG file with both sides divided by this number.
+        white: Value of white, for a photo with 16 bits.
 
     Raises:
-        UserError: The photo is damaged or of an unsupported kind.
+        UserError: The photo is damaged, or its kind is not supported.
     """
     if white == FULL_16_BIT:
         return _decode(path, _read_photo, reduction)
@@ -55,22 +57,23 @@ def decode_photo(
 
 
 def brightest(path: Path) -> int:
-    """Return the largest value of a photo of 16 bits.
+    """Return the largest value in a photo with 16 bits.
 
     Raises:
-        UserError: The photo is damaged or of an unsupported kind.
+        UserError: The photo is damaged, or its kind is not supported.
     """
     return int(_decode_deep(path)[0].max())
 
 
 def decode_mask(path: Path) -> Pixels:
-    """Decode a mask [H, W]: 255 if a pixel is at least half white and therefore counts, else 0.
+    """Decode a mask [H, W]: 255 for pixels that are at least half white (valid pixels), else 0.
 
-    White is the largest value of the smallest bit depth that holds all values: 1, 255, 4095 ...
-    If transparency varies and the colours are not black and white, alpha is used as the mask.
+    White is the largest value of the smallest bit depth that can contain all values of the mask: 1,
+    255, 1023, 4095, 16383 or 65535. If the alpha channel varies and the colours are not black and
+    white, the alpha channel is the mask.
 
     Raises:
-        UserError: The mask is damaged or of an unsupported kind.
+        UserError: The mask is damaged, or its kind is not supported.
     """
     grey = _decode(path, _read_mask)
     white = next(white for white in WHITES if white >= min(grey.max(), FULL_16_BIT))
@@ -78,7 +81,10 @@ def decode_mask(path: Path) -> Pixels:
 
 
 def resize(image: Pixels, width: int, height: int) -> Pixels:
-    """Resize [H, W] or [H, W, C], bit-equal to scikit-image's anti-aliased resize."""
+    """Resize an image [H, W] or [H, W, C].
+
+    The result is bit-identical to scikit-image's anti-aliased resize.
+    """
     tall, wide = image.shape[:2]
     if (tall, wide) == (height, width):
         return image
@@ -96,14 +102,17 @@ def _resized_by_skimage(image: Pixels, width: int, height: int) -> Pixels:
     from skimage import transform
 
     resize_floats: Callable[..., NDArray[np.float32]] = transform.resize
-    # Resizing in float32 takes half the time of float64. The results differ by less than a
-    # hundredth of a grey level.
+    # Resizing takes half as long in float32 as in float64. The results in float32 and float64
+    # differ by less than a hundredth of a grey level.
     floats = resize_floats(image.astype(np.float32), (height, width), anti_aliasing=True)
     return np.asarray(np.rint(floats).clip(0, _FULL_8_BIT), dtype=np.uint8)
 
 
 def _gaussian(factor: float) -> NDArray[np.float64]:
-    """Return the weights of the filter for a side divided by `factor`, from the middle outwards."""
+    """Return the filter weights, from the middle outwards.
+
+    The filter is for a side that is divided by `factor`.
+    """
     deviation = (factor - 1.0) / 2.0
     radius = int(_WIDTHS * deviation + 0.5)
     if radius == 0:
@@ -113,7 +122,7 @@ def _gaussian(factor: float) -> NDArray[np.float64]:
 
 
 def blend(rgb: Pixels, alpha: Pixels, background: tuple[float, float, float]) -> Pixels:
-    """Blend a photo [H, W, 3] over a colour in [0, 1] by its alpha [H, W]."""
+    """Blend a photo [H, W, 3] with a background colour in [0, 1], by its alpha channel [H, W]."""
     weight = alpha[..., None].astype(np.float32) / _FULL_8_BIT
     behind = np.array(background, dtype=np.float32) * _FULL_8_BIT
     mixed = rgb * weight + behind * (1 - weight)
@@ -121,7 +130,7 @@ def blend(rgb: Pixels, alpha: Pixels, background: tuple[float, float, float]) ->
 
 
 def turn(pixels: Pixels, orientation: int) -> Pixels:
-    """Turn pixels [H, W, ...] upright by an EXIF orientation of a quarter turn (5 to 8)."""
+    """Rotate pixels [H, W, ...] upright by an EXIF orientation with a quarter turn (5 to 8)."""
     turned = {
         5: pixels.swapaxes(0, 1),
         6: np.rot90(pixels, -1),
@@ -147,7 +156,10 @@ def _decode(path: Path, read: "Callable[[Image], T]", reduction: int = 1) -> T:
 
 
 def _decode_deep(path: Path) -> tuple[NDArray[np.int32], Pixels | None]:
-    """Decode a photo of 16 bits to grey [H, W, 1] or RGB [H, W, 3], and to 8-bit alpha, if any."""
+    """Decode a photo with 16 bits to grey [H, W, 1] or RGB [H, W, 3].
+
+    If the photo has an alpha channel, return it with 8 bits.
+    """
     upper = _decode(path, np.array)
     if upper.ndim == 2:  # noqa: PLR2004 - grey, which Pillow decodes to 16 bits
         return upper[..., None].astype(np.int32), None
@@ -173,7 +185,10 @@ def _read_photo(image: "Image") -> tuple[Pixels, Pixels | None]:
 
 
 def _colours(image: "Image") -> Pixels:
-    """Decode an RGB photo [H, W, 3] in bands: np.asarray copies large photos three times."""
+    """Decode an RGB photo [H, W, 3] in bands of rows.
+
+    For large photos, np.asarray would make three copies.
+    """
     pixels = np.empty((image.height, image.width, 3), np.uint8)
     rows = max(1, _BAND // pixels[0].size)
     for top in range(0, image.height, rows):
@@ -184,13 +199,17 @@ def _colours(image: "Image") -> Pixels:
 
 
 def _read_grey(image: "Image") -> NDArray[np.int32]:
-    """Read grey [H, W] in the file's own range: up to 255, or up to 65535."""
+    """Read a grey image [H, W] in the value range of its file: up to 255, or up to 65535."""
     wide = image if image.mode.startswith("I") else image.convert("L")
     return np.array(wide).astype(np.int32)
 
 
 def _read_mask(image: "Image") -> NDArray[np.int32]:
-    """Read grey [H, W], or alpha if alpha varies and the colours are not black and white."""
+    """Read a mask [H, W] from the grey values of an image.
+
+    If the image has an alpha channel that varies, and its colours are not black and white, alpha is
+    used instead.
+    """
     if image.mode.startswith("I") or not pillow.has_alpha(image):
         return _read_grey(image)
     grey, alpha = (np.array(band).astype(np.int32) for band in image.convert("LA").split())
@@ -200,7 +219,7 @@ def _read_mask(image: "Image") -> NDArray[np.int32]:
 
 
 def _is_black_and_white(grey: NDArray[np.int32]) -> bool:
-    """Return True if both black and white occur, and hardly any other value."""
+    """Return True if both black and white pixels occur, and hardly any grey pixels."""
     black, white = grey < _FULL_8_BIT // 10, grey > _FULL_8_BIT - _FULL_8_BIT // 10
     neither = 1.0 - float(black.mean() + white.mean())
     return bool(black.any() and white.any() and neither <= _MOST_GREY)

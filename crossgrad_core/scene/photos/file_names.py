@@ -1,6 +1,6 @@
-"""Matching of a scene's files with the names that other programs use, and file kinds by name.
+"""Match the files of a scene with names from other programs, and derive file kinds from names.
 
-Names from other programs may have other folders, another suffix or another letter case.
+Names from other programs may differ in folders, suffix or letter case.
 """
 
 import os
@@ -15,16 +15,16 @@ from typing import Final, TypeAlias
 
 from crossgrad_core.scene.photos.pillow import SUFFIXES
 
-#: Similarity of a file's path to a name. Its parts are: same folders, number of equal folders at
-#: the end, one path ends with the other path, same base name except letter case, same base name.
-#: Greater is more similar.
+#: Similarity of a file's path to a name; greater is more similar. The elements are: equal folders,
+#: number of equal folders at the end, whether one path ends with the other path, equal base name
+#: except letter case, equal base name.
 _Likeness: TypeAlias = tuple[bool, int, bool, bool, bool]
 #: Suffixes of photos and masks.
 IMAGES: Final = frozenset(
     {".avif", ".bmp", ".gif", ".jp2", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff"}
     | {".webp", *SUFFIXES}
 )
-#: Kinds of files.
+#: Kinds of files, as named in messages.
 PHOTO, COPY, MASK, DEPTH = "photo", "smaller copy of a photo", "mask", "depth or normal map"
 RAW, POINTS, TABLE = "raw photo", "point file", "CSV file"
 _BY_SUFFIX: Final = {
@@ -39,17 +39,18 @@ _WORDS: Final = {
     **dict.fromkeys(("depth", "depths", "disparity", "normal", "normals"), DEPTH),
 }
 _COPIES: Final = re.compile(r"(images|photos|rgb)_[248]")
-#: Array files. Their kind is known only if a word in the path gives it.
+#: Suffixes of array files. The kind of an array file is known only if a word in its path names a
+#: kind.
 _ARRAYS: Final = frozenset({".npy", ".npz"})
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """Names and their files.
+    """Names, and the files that match these names.
 
     Attributes:
-        files: Name -> file with this name.
-        ambiguous: Name -> the files that fit it equally well.
+        files: Name -> the only file that matches the name.
+        ambiguous: Name -> the files that match the name equally well.
     """
 
     files: Mapping[str, str]
@@ -57,17 +58,17 @@ class Pairs:
 
 
 class FileNames:
-    """Files below one folder, found by the names that other programs use for them.
+    """Files below a folder. The files can be found by the names that other programs use for them.
 
-    A name matches the file with the same path. If there is no such file, a name matches the file
-    with the same base name and the most similar path. Suffix, case and Unicode form may differ. A
-    file in another folder matches only if the name's own folder does not exist. If the name's own
-    folder exists, the name has no file.
+    A name matches the file with exactly the same path. Without such a file, the name matches the
+    file with the same base name and the most similar path. Suffix, letter case and Unicode form may
+    differ. A file in another folder matches only if the folder in the name does not exist. If this
+    folder exists but does not contain the file, the name has no file.
 
     Args:
-        names: Paths below the folder, with forward slashes.
-        called: Returns the name that is used to compare a path.
-        aside: Returns True for a path that must not match a name in other folders.
+        names: Paths of the files below the folder, with forward slashes.
+        called: Function from a path to the path that is compared with names.
+        aside: Function that returns True for a path that must not match names in other folders.
     """
 
     def __init__(
@@ -84,20 +85,26 @@ class FileNames:
             self._alike[_base(without_suffix(call))].append(name)
 
     def find(self, name: str) -> str | None:
-        """Return the only file that matches a name; None if no file or several files match."""
+        """Return the only file that matches a name.
+
+        Return None if no file or several files match.
+        """
         return self.pair((name,)).files.get(name)
 
     def fitting(self, name: str) -> list[str]:
-        """Return the files that match a name equally well, sorted."""
+        """Return the files that match a name equally well, in sorted order."""
         pairs = self.pair((name,))
         return sorted(pairs.ambiguous.get(name) or filter(None, [pairs.files.get(name)]))
 
     def pair(self, names: Collection[str], taken: Container[str] = ()) -> Pairs:
-        """Find the file of each name. A file belongs to the name that is most similar to its path.
+        """Find the file of each name.
+
+        If several names match a file, the file belongs to the name that is most similar to its
+        path.
 
         Args:
-            names: The names, relative or absolute, with forward slashes or backslashes.
-            taken: Files that must not match any of the names.
+            names: Relative or absolute paths, with forward slashes or backslashes.
+            taken: Files that must not be matched with any name.
         """
         exact = {name: name for name in names if name in self._called and name not in taken}
         best = {
@@ -109,7 +116,8 @@ class FileNames:
         for likeness, files in best.values():
             for file in files:
                 claims[file].append(likeness)
-        # Do not pair a file with this name if another name is more similar to the file's path.
+        # A file is not matched with this name if another name is more similar to the path of the
+        # file.
         held = {
             name: (likeness, [file for file in files if likeness == max(claims[file])])
             for name, (likeness, files) in best.items()
@@ -126,7 +134,7 @@ class FileNames:
     def _most_alike(
         self, name: str, is_taken: Callable[[str], bool]
     ) -> tuple[_Likeness, list[str]]:
-        """Return the files that are most similar to a name, and their similarity."""
+        """Return the files whose paths are most similar to a name, and their similarity."""
         likeness_by_file: dict[str, _Likeness] = {}
         for base in {_base(name), _stem(name)}:
             for file in self._alike.get(base, ()):
@@ -137,7 +145,10 @@ class FileNames:
         return most, [file for file, likeness in likeness_by_file.items() if likeness == most]
 
     def _likeness(self, name: str, file: str) -> _Likeness | None:
-        """Return the similarity of a file's path to a name; None if the name's folder exists."""
+        """Return the similarity of a file's path to a name.
+
+        Return None if the file must not match the name.
+        """
         call = self._called[file]
         name_folders, file_folders = _folders(name), _folders(call)
         pairs = zip(reversed(name_folders), reversed(file_folders), strict=False)
@@ -146,7 +157,7 @@ class FileNames:
         missing = shared < len(name_folders) and name_folders[-1 - shared] in self._folders
         if name_folders != file_folders and (missing or self._aside(file)):
             return None
-        # A name without a suffix may contain dots.
+        # A name without a suffix may still contain dots.
         whole = _base(name) in {_base(call), _base(without_suffix(call))}
         return (
             name_folders == file_folders,
@@ -158,17 +169,20 @@ class FileNames:
 
 
 def is_absolute(name: str) -> bool:
-    """Return True if a name is an absolute path, of this system or of Windows."""
+    """Return True if a name is an absolute path on this system or on Windows."""
     return name.startswith(("/", "\\")) or bool(PureWindowsPath(name).drive)
 
 
 def same_spelling(name: str, other: str) -> bool:
-    """Return True if two names differ at most in suffix, case and Unicode form."""
+    """Return True if two names are equal except for suffix, letter case and Unicode form."""
     return _folders(name) == _folders(other) and _stem(name) == _stem(other)
 
 
 def without_suffix(name: str) -> str:
-    """Return a name without the suffix of an image, if it ends with one."""
+    """Return a name without its image suffix.
+
+    Without an image suffix, the name is returned unchanged.
+    """
     stem, suffix = os.path.splitext(name)
     return stem if suffix.lower() in IMAGES else name
 
@@ -182,12 +196,15 @@ def _folders(name: str) -> list[str]:
 
 
 def _base(name: str) -> str:
-    """Return the base name of a path, in one case and Unicode form."""
+    """Return the base name of a path. Letter case and Unicode form are normalized."""
     return _fold("".join(_parts(name)[-1:]))
 
 
 def _stem(name: str) -> str:
-    """Return the base name of a path without any suffix, in one case and Unicode form."""
+    """Return the base name of a path without its suffix.
+
+    Letter case and Unicode form are normalized.
+    """
     return PurePosixPath(_base(name)).stem
 
 
@@ -196,9 +213,11 @@ def _fold(text: str) -> str:
 
 
 def kind_of(name: str) -> str | None:
-    """Return the kind of a file by its path below the scene; None for an unknown kind.
+    """Return the kind of a file, derived from its path below the scene.
 
-    Images are photos, unless a word in the file name or in a folder name gives another kind.
+    Return None if the kind is unknown.
+
+    Images are photos, unless a word in the path names another kind.
     """
     path = PurePosixPath(name)
     suffix = path.suffix.lower()

@@ -1,4 +1,4 @@
-"""Headers of photo files: size and kind without decoding, and a check for truncated files."""
+"""Read the size and kind of photos from their headers, and detect truncated files."""
 
 from dataclasses import dataclass, replace
 from math import inf
@@ -16,23 +16,24 @@ _JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", 0xDA, b"\xff\xd9"
 _PNG_START, _PNG_END = b"\x89PNG", b"IEND\xaeB`\x82"
 _PNG_DEPTH, _PNG_CHANNELS = 24, {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 _JPEG_PIXELS_PER_BYTE = 8 * 64
-_DEFLATE_RATIO = 1032  # Maximum compression factor, https://zlib.net/zlib_tech.html
+_DEFLATE_RATIO = 1032  # Maximum compression factor of deflate, https://zlib.net/zlib_tech.html
 _ORIENTATION = 0x0112
 _QUARTER_TURNS = range(5, 9)
-_TIFF_DATA = ((273, 279), (324, 325))  # tags of the offsets and byte counts of strips and of tiles
+# Tags of the offsets and byte counts of strips, and of tiles.
+_TIFF_DATA = ((273, 279), (324, 325))
 
 
 @dataclass(frozen=True)
 class PhotoHeader:
-    """The size of the stored pixel grid, before any EXIF rotation, and the kind of pixels.
+    """The size and kind of a photo's pixels as stored, before any EXIF rotation.
 
     Attributes:
-        width: Pixels.
-        height: Pixels.
+        width: Width in pixels.
+        height: Height in pixels.
         alpha: True if pixels may be transparent.
-        grey: True if the photo has no colour.
-        reducible: True if the photo can be decoded at a reduced size in less memory.
-        deep: True if the photo is grey, RGB or RGBA with 16 bits per channel.
+        grey: True if the photo contains no colours.
+        reducible: True if the photo can be decoded at a reduced size with less memory.
+        deep: True if the photo is grey, RGB or RGBA, with 16 bits per channel.
     """
 
     width: int
@@ -43,15 +44,15 @@ class PhotoHeader:
     deep: bool = False
 
     def reduced(self, by: int) -> "PhotoHeader":
-        """Return the header for decoding with each side divided by 1, 2, 4 or 8."""
+        """Return the header for a photo that is decoded with both sides divided by `by`."""
         return replace(self, width=-(-self.width // by), height=-(-self.height // by))
 
 
 def read_header(path: Path) -> PhotoHeader:
-    """Read the header of a photo and check cheaply that the file is not truncated.
+    """Read the header of a photo. Check without decoding that the file is not truncated.
 
     Raises:
-        UserError: The file is not a readable photo, or its end is missing.
+        UserError: The file is not a readable photo, or the end of the file is missing.
     """
     with opened(path, "the photo cannot be read") as image, path.open("rb") as file:
         size = path.stat().st_size
@@ -68,10 +69,10 @@ def read_header(path: Path) -> PhotoHeader:
 
 
 def read_quarter_turn(path: Path) -> int | None:
-    """Return the EXIF orientation of a photo if it swaps width and height (5 to 8), else None.
+    """Return the EXIF orientation of a photo if it swaps width and height (5 to 8); otherwise None.
 
     Raises:
-        UserError: The EXIF header is damaged.
+        UserError: The EXIF header of the photo is damaged.
     """
     with opened(path, "the photo's EXIF header cannot be read") as image:
         orientation = image.getexif().get(_ORIENTATION)
@@ -87,12 +88,16 @@ def _describe(image: "Image") -> PhotoHeader:
 
 
 def _most_pixels(image: "Image", file: BinaryIO, size: int) -> float:
-    """Return the largest number of pixels that `size` bytes can hold; inf for other formats.
+    """Return the largest number of pixels that a file of `size` bytes can contain.
 
-    A header that claims more pixels would make the decoder allocate memory for a missing photo.
+    Return inf for formats without a known limit.
+
+    If a header claims more pixels, the decoder would allocate memory for pixels that the file does
+    not contain.
     """
     if image.format in {"JPEG", "MPO"}:
-        # Each block of 8 x 8 pixels needs at least one bit: the Huffman code of its mean.
+        # A JPEG file needs at least one bit for each block of 8 x 8 pixels: the Huffman code of the
+        # block's mean.
         return _JPEG_PIXELS_PER_BYTE * size
     if image.format == "PNG":
         file.seek(_PNG_DEPTH)
@@ -102,7 +107,10 @@ def _most_pixels(image: "Image", file: BinaryIO, size: int) -> float:
 
 
 def _is_whole(file: BinaryIO) -> bool:
-    """Return True if a JPEG, PNG or WebP file is complete; leaves the file at its start."""
+    """Return True if a JPEG, PNG or WebP file is complete.
+
+    The file position is reset to the start.
+    """
     head = file.read(12)
     size = file.seek(0, 2)
     file.seek(max(0, size - _TAIL))
@@ -118,9 +126,9 @@ def _is_whole(file: BinaryIO) -> bool:
 
 
 def _has_jpeg_end(file: BinaryIO) -> bool:
-    """Return True if an end marker follows the first scan: data after the photo is allowed.
+    """Return True if an end marker follows the first scan. Data after the photo are allowed.
 
-    The thumbnail in the EXIF header has its own end marker, which is ignored.
+    The thumbnail in the EXIF header has its own end marker, which this function ignores.
     """
     data = file.read()
     file.seek(0)

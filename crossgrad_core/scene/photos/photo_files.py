@@ -1,4 +1,4 @@
-"""Matching of a scene's posed photos and masks with files by name."""
+"""Match photos and masks with files by their names."""
 
 import os
 import re
@@ -29,10 +29,10 @@ _DECORATION: Final = re.compile(rf"^{_WORD}[ ._-]+|[ ._-]+{_WORD}$", re.IGNORECA
 
 
 class PhotoFolder:
-    """The photos below one folder, which are found by name.
+    """The photos below a folder, which can be found by their names.
 
     Args:
-        path: The folder; it may be missing.
+        path: Path of the folder; the folder may be missing.
     """
 
     def __init__(self, path: Path) -> None:
@@ -40,10 +40,10 @@ class PhotoFolder:
         self.names = tuple(sorted(_list_photos(path)))
 
     def pair(self, names: Collection[str]) -> Pairs:
-        """Find the photo of each posed image; see `FileNames`.
+        """Find the photo of each posed image, as described in `FileNames`.
 
         Args:
-            names: Names of the photos in the pose file.
+            names: Names of the images in the pose file.
         """
         there = {name: name for name in names if self._holds(name)}
         rest = [name for name in names if name not in there]
@@ -54,13 +54,13 @@ class PhotoFolder:
         return replace(pairs, files={**there, **pairs.files})
 
     def _holds(self, name: str) -> bool:
-        """Return True if a file of this name exists, whatever its suffix."""
+        """Return True if a file with exactly this name exists; any suffix is allowed."""
         inside = not is_absolute(name) and ".." not in PurePosixPath(name).parts
         return inside and is_file(self.path / name)
 
 
 def find_photo_folders(images: Path) -> list[PhotoFolder]:
-    """Return the existing photo folders: full size first, then `<images>_2`, `_4`, `_8`.
+    """Return the existing photo folders: full-size photos first, then `<images>_2`, `_4`, `_8`.
 
     Raises:
         UserError: No photo folder exists.
@@ -80,14 +80,15 @@ def find_photo_folders(images: Path) -> list[PhotoFolder]:
 
 
 def walked(folder: Path) -> Iterator[tuple[str, list[str], list[str]]]:
-    """Walk a folder, then the folders that its links point to, each folder once.
+    """Walk a folder, and then the folders that its links point to. Each folder is visited once.
 
-    Links inside linked folders are not followed. A link to a parent of the folder is not followed.
+    Links inside a linked folder are not followed. A link to a parent folder of `folder` is not
+    followed.
 
     Yields:
         The path relative to the folder with forward slashes (`.` for the folder itself), the names
         of its subfolders, and the names of its files. A caller can remove subfolders from the list
-        to skip them.
+        to skip these subfolders.
     """
     seen: set[str] = set()
     links: list[Path] = []
@@ -111,7 +112,7 @@ def _tree(folder: Path, start: Path, seen: set[str]) -> Iterator[tuple[str, list
 
 
 def _list_photos(folder: Path) -> list[str]:
-    """Return the names of all photos below a folder, with forward slashes."""
+    """Return the paths of all photos below a folder, with forward slashes."""
     names: list[str] = []
     for below, _, files in walked(folder):
         prefix = "" if below == "." else below + "/"
@@ -120,9 +121,9 @@ def _list_photos(folder: Path) -> list[str]:
 
 
 def mask_names(name: str) -> tuple[str, ...]:
-    """Return the possible names of a photo's mask in a mask folder; the first existing file counts.
+    """Return the possible names of a photo's mask, in order of priority.
 
-    `aerial/0001.jpg` has the mask `aerial/0001.jpg.png` (COLMAP), `aerial/0001.png`,
+    `aerial/0001.jpg` can have the mask `aerial/0001.jpg.png` (COLMAP), `aerial/0001.png`,
     `aerial/0001_mask.png` (Metashape) or `aerial/0001.jpg`.
     """
     stem = str(PurePosixPath(name).with_suffix(""))
@@ -130,19 +131,19 @@ def mask_names(name: str) -> tuple[str, ...]:
 
 
 def find_mask(folder: Path, name: str) -> Path | None:
-    """Return the mask of a photo; None without a mask."""
+    """Return the path of a photo's mask; None if the photo has no mask."""
     return next(filter(is_file, (folder / mask_name for mask_name in mask_names(name))), None)
 
 
 def pair_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
-    """Find the mask of each photo, if there is one.
+    """Find the masks of photos, as far as masks exist.
 
-    The names of `mask_names` are tried first. Then other folders, suffixes and letter cases are
-    tried, and finally names with a word such as `mask` before or after the photo's name.
+    The names from `mask_names` have priority. After that, folders, suffix and letter case may
+    differ. Finally, a word such as `mask` may precede or follow the photo's name.
 
     Args:
-        folder: The folder of the masks.
-        names: The photos.
+        folder: Folder of the masks.
+        names: Names of the photos.
     """
     masks = {name: path for name in names if (path := find_mask(folder, name)) is not None}
     there = frozenset(PhotoFolder(folder).names) if len(masks) < len(names) else frozenset()
@@ -154,10 +155,13 @@ def pair_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
 
 
 def find_mask_folder(option: Path | None, root: Path) -> Path | None:
-    """Return the option's folder, as given or in the scene; else `<scene>/masks`, if it exists.
+    """Return the mask folder.
+
+    The mask folder is the folder of the option, as a path or relative to the scene. Without the
+    option, the mask folder is `<scene>/masks`, if this folder exists.
 
     Raises:
-        UserError: The folder of the option does not exist.
+        UserError: The folder that the option names does not exist.
     """
     if option is None:
         return next(_default_folders(root), None)
@@ -173,10 +177,12 @@ def find_mask_folder(option: Path | None, root: Path) -> Path | None:
 
 
 def check_masks(folder: Path, option: Path | None, found: int, names: Sequence[str]) -> None:
-    """Refuse a mask folder without a mask for any photo; an empty default folder is ignored.
+    """Raise an error if a mask folder contains no mask for any photo.
+
+    An empty default folder is accepted.
 
     Raises:
-        UserError: No photo has a mask in the folder.
+        UserError: The folder contains no mask for any photo.
     """
     there = PhotoFolder(folder).names if not found else ()
     if found or (option is None and not there):
@@ -193,7 +199,7 @@ def check_masks(folder: Path, option: Path | None, found: int, names: Sequence[s
 
 
 def _default_folders(root: Path) -> Iterator[Path]:
-    """Yield `<scene>/masks`, and folders whose name differs in letter case only."""
+    """Yield `<scene>/masks`, and folders whose name differs from `masks` only in letter case."""
     if (root / _DEFAULT).is_dir():
         yield root / _DEFAULT
     alike = (path for path in sorted(root.iterdir()) if path.name.casefold() == _DEFAULT)
@@ -201,20 +207,20 @@ def _default_folders(root: Path) -> Iterator[Path]:
 
 
 def _undecorated(name: str) -> str:
-    """Return the name of a mask without a word such as `mask` at its start or end."""
+    """Return the name of a mask without a word such as `mask` at the start or end."""
     path = PurePosixPath(without_suffix(name))
     stem = without_suffix(_DECORATION.sub("", path.name))
     return str(path.with_name(stem)) if stem else str(path)
 
 
 def with_photo_names(raw: RawScene) -> RawScene:
-    """Return the scene with each posed image under the path of its photo below `images`.
+    """Return the scene with each image named by the path of its photo below `images`.
 
-    Programs write absolute paths, or paths relative to another folder. Suffix and case of a name
-    are kept, even if they differ from the photo file.
+    Programs may write absolute paths, or paths relative to another folder. A name is unchanged if
+    it differs from the name of its photo only in suffix or letter case.
 
     Raises:
-        UserError: There is no photo folder, or an absolute path fits several photos.
+        UserError: The photo folder is missing, or an absolute path matches several photos.
     """
     names = [view.name for view in raw.views]
     if all(not is_absolute(name) and is_file(raw.images / name) for name in names):

@@ -1,4 +1,4 @@
-"""Notes about the files of a scene: the processing of its photos, and unused files."""
+"""Write notes on the photos of a scene, the processing of photos, and unused files."""
 
 import os
 from collections import Counter, defaultdict
@@ -19,21 +19,24 @@ from crossgrad_core.wording import listed
 
 _MIB = 2**20
 _SHOWN_SIZES = 3
-#: The undistortion of ordinary lenses removes less than this share of the pixels.
+#: Lenses without a wide angle lose less than this share of the pixels by undistortion.
 _WORTH_A_NOTE = 0.1
 Sources = Mapping[str, PhotoSource]
-#: Files that crossgrad writes. A folder that contains a file of the first set was written by a run
-#: or by `prepare`.
+#: Names of files that crossgrad writes. A folder with a file of the first set was written by a run
+#: or by `prepare`, and is skipped.
 _OWN_FOLDERS: Final = frozenset({"config.yaml", "plan.json"})
 _OWN_FILES: Final = frozenset({"report.png"})
-#: Maximum number of groups of unused files with a separate note.
+#: Maximum number of groups of unused files that get a note of their own.
 _MOST: Final = 8
 
 
 def note_pairing(
     folder: PhotoFolder, paths: Mapping[str, Path], names: Sequence[str], used: Collection[Path]
 ) -> list[str]:
-    """Note posed images without a photo, photos without a pose, and names spelled differently."""
+    """Note posed images without a photo and photos without a pose.
+
+    Note photos whose names differ in suffix or letter case.
+    """
     absent = [name for name in names if name not in paths]
     used_paths = frozenset(used)
     others = [name for name in folder.names if folder.path / name not in used_paths]
@@ -52,7 +55,7 @@ def note_pairing(
 
 
 def note_links(root: Path, sources: Sources) -> list[str]:
-    """Note photos and masks that are stored outside the scene's folder."""
+    """Note photos and masks whose files are outside the scene's folder."""
     home = os.path.join(os.path.realpath(root), "")
     files = [file for source in sources.values() for file in (source.path, source.mask) if file]
     outside = [file for file in files if not os.path.realpath(file).startswith(home)]
@@ -68,7 +71,7 @@ def note_links(root: Path, sources: Sources) -> list[str]:
 
 
 def note_undistortion(sources: Sources) -> list[str]:
-    """Note the number of undistorted photos, by camera model."""
+    """Note how many photos of each camera model are undistorted."""
     models = Counter(s.distorted.model for s in sources.values() if s.distorted is not None)
     if not models:
         return []
@@ -78,7 +81,7 @@ def note_undistortion(sources: Sources) -> list[str]:
 
 
 def _costs(sources: Sources) -> list[str]:
-    """Note the losses of undistortion for lenses that fold over or are wider than a pinhole."""
+    """Note lenses whose model folds over, and lenses that lose many pixels by undistortion."""
     lenses = [source.distorted for source in sources.values() if source.distorted is not None]
     lens_costs = [(lens, cost) for lens in lenses if (cost := lens.cost) is not None]
     folded = [(lens.model, cost.beyond) for lens, cost in lens_costs if cost.beyond > 0.0]
@@ -107,7 +110,7 @@ def _percent(shares: Sequence[float]) -> str:
 
 
 def _degrees(values: Sequence[float]) -> str:
-    """Format the range from the smallest to the largest value in whole numbers."""
+    """Format the range of the values as whole numbers, such as `3 to 5`."""
     low, high = (f"{value:.0f}" for value in (min(values), max(values)))
     return low if low == high else f"{low} to {high}"
 
@@ -115,7 +118,7 @@ def _degrees(values: Sequence[float]) -> str:
 def note_sizes(
     folder: str, sources: Sources, calibrated: Mapping[str, tuple[int, int]]
 ) -> list[str]:
-    """Note the training sizes, the folder of the photos, and the resize filter."""
+    """Note the sizes of the training photos, their folder, and how they were resized."""
     sizes = Counter(source.target for source in sources.values()).most_common()
     shown = [f"{width} x {height} px ({number})" for (width, height), number in sizes]
     text = ", ".join(shown[:_SHOWN_SIZES])
@@ -131,7 +134,7 @@ def note_sizes(
 
 
 def note_reductions(sources: Sources) -> list[str]:
-    """Note the number of photos that are decoded at a reduced size because of their size."""
+    """Note how many photos are decoded at a reduced size because they are too large."""
     reduced = [s.reduction for s in sources.values() if s.reduction > 1]
     if not reduced:
         return []
@@ -145,7 +148,7 @@ def note_kinds(
     headers: Mapping[str, PhotoHeader],
     background: tuple[float, float, float] | None,
 ) -> list[str]:
-    """Note the numbers of turned, transparent, grey and masked photos."""
+    """Note how many photos are rotated, transparent, grey or masked."""
     total = len(sources)
     over = f"blended over RGB {background}" if background else "pixels with alpha < 0.5 are ignored"
     counted = (
@@ -175,7 +178,7 @@ def note_kinds(
 
 
 def note_memory(sources: Sources, options: SceneOptions) -> list[str]:
-    """Note if the decoded photos do not fit into the memory reserved for them."""
+    """Note if the decoded photos do not fit into the memory of the photo cache."""
     need = sum(3 * s.target[0] * s.target[1] for s in sources.values()) / _MIB
     if need <= options.cache_mib:
         return []
@@ -189,14 +192,16 @@ def note_memory(sources: Sources, options: SceneOptions) -> list[str]:
 
 
 def note_unused(raw: RawScene, used: Iterable[Path], masks: Path | None) -> list[str]:
-    """Note unused photos, masks, depth maps, points and tables: one note per folder and reason.
+    """Note unused photos, masks, depth maps, points and tables.
 
-    Photos without a pose in the photo folder are excluded: `note_pairing` reports them.
+    Each folder and reason has its own note.
+
+    Photos without a pose in the photo folder are not included, because `note_pairing` reports them.
 
     Args:
-        raw: The scene.
-        used: Files that are used, in addition to the files of the reader.
-        masks: The folder of the masks, if any.
+        raw: The scene from the reader.
+        used: Paths of the used files, without the files that the reader used.
+        masks: Folder of the masks; None without masks.
     """
     groups = defaultdict[tuple[str, str], list[str]](list)
     for name, reason in _unused(raw, [*used, *raw.files], masks).items():
@@ -216,7 +221,7 @@ def note_unused(raw: RawScene, used: Iterable[Path], masks: Path | None) -> list
 
 
 def _unused(raw: RawScene, used: Iterable[Path], masks: Path | None) -> dict[str, str]:
-    """Return the files that are not used, directly or through links, with the reasons."""
+    """Return the files that are used neither directly nor through links, with the reasons."""
     used_paths, home = set(map(os.path.abspath, used)), os.path.abspath(raw.root)
     files = [name for name in _files(raw.root) if os.path.join(home, name) not in used_paths]
     reasons = {name: reason for name in files if (reason := _reason(name, raw, masks))}
@@ -231,7 +236,10 @@ def _unused(raw: RawScene, used: Iterable[Path], masks: Path | None) -> dict[str
 
 
 def _files(root: Path) -> Iterator[str]:
-    """Yield the paths of the files below a scene, except hidden files and outputs of crossgrad."""
+    """Yield the paths of all files below a scene.
+
+    Hidden files and outputs of crossgrad are skipped.
+    """
     for below, folders, files in walked(root):
         if below != "." and _OWN_FOLDERS & set(files):
             folders.clear()
@@ -243,7 +251,10 @@ def _files(root: Path) -> Iterator[str]:
 
 
 def _reason(name: str, raw: RawScene, masks: Path | None) -> str | None:
-    """Return why a file is not used; None for an unknown kind or a file with a separate note."""
+    """Return why a file is not used.
+
+    Return None for unknown kinds and for files that another note reports.
+    """
     kind, path = kind_of(name), raw.root / name
     if kind is None or (kind is PHOTO and path.is_relative_to(raw.images)):
         return None

@@ -1,8 +1,9 @@
-"""A disk cache of photos in their training size, shared by all runs.
+"""A disk cache of photos in their training size, which all runs share.
 
-A file holds one photo. The name of the file is a hash of everything that determines the pixels, so
-an entry never needs an update. An entry is written completely or not at all. An entry contains a
-checksum, and an entry with any unexpected property counts as missing.
+Each file of the cache (an entry) contains one photo. The name of an entry is a hash of everything
+that determines the pixels. An entry never changes, because its name is a hash of the inputs. An
+entry is written completely or not at all. Each entry contains a checksum. An invalid entry counts
+as missing.
 """
 
 import logging
@@ -26,17 +27,18 @@ import torch
 from torch import Tensor
 
 _LOG = logging.getLogger(__name__)
-#: Environment variable for the folder of all entries. The default is in the user's cache folder.
+#: Environment variable that sets the folder of the cache. Without the variable, the cache is in the
+#: user's cache folder.
 FOLDER: Final = "CROSSGRAD_CACHE"
-#: Raised whenever decoding, undistorting or resizing gives other bits than before.
+#: Increase this number whenever decoding, undistorting or resizing changes any bit of the results.
 PIXELS_VERSION: Final = 2
-#: Number of bytes that must remain free on the disk.
+#: Number of bytes that the cache leaves free on the disk.
 RESERVE: Final = 2 * 2**30
 _MAGIC, _SUM = b"CGphoto1", 4
 _KEPT, _TEMPORARY = ".photo", ".tmp"
-#: An unfinished file that is older than this many seconds belongs to a killed process.
+#: Age in seconds after which an unfinished file counts as left behind by a killed process.
 _STALE = 3600.0
-#: Uncertainty of file times in seconds.
+#: Possible error of file times, in seconds.
 _GRAIN = 2.0
 _NUMBER = count()
 
@@ -44,25 +46,31 @@ Decoded = tuple[Tensor, Tensor | None]
 
 
 class Storable(Protocol):
-    """An image that can be decoded and that may be cached on disk."""
+    """A photo that can be decoded and may be cached on disk."""
 
     @property
     def target(self) -> tuple[int, int]:
-        """(width, height) as trained."""
+        """Width and height of the training photo."""
         ...
 
     @property
     def origin(self) -> str | None:
-        """Everything that determines the pixels; None if decoding is as fast as reading."""
+        """Text with everything that determines the pixels.
+
+        The text is None if reading from the cache would save no time.
+        """
         ...
 
     def decode(self) -> Decoded:
-        """Return the photo [H, W, 3] uint8 and its mask [H, W] bool; None if all pixels count."""
+        """Return the photo [H, W, 3] uint8 and its mask [H, W] bool.
+
+        The mask is None if all pixels are valid.
+        """
         ...
 
 
 def store_folder() -> Path:
-    """Return the cache folder: `CROSSGRAD_CACHE`, or a folder in the user's cache folder."""
+    """Return the folder of the cache: `CROSSGRAD_CACHE`, or a folder in the user's cache folder."""
     if given := os.environ.get(FOLDER):
         return Path(given) / "photos"
     beside = {"darwin": "~/Library/Caches", "win32": os.environ.get("LOCALAPPDATA", "~")}
@@ -71,15 +79,17 @@ def store_folder() -> Path:
 
 
 class PhotoStore:
-    """A folder of decoded photos of bounded size; several threads and processes may share it.
+    """A folder of decoded photos with limited size.
 
-    Entries used since this store was opened are kept. If space is needed, the other entries are
-    deleted, least recently used first. If the deletions do not free enough space, or if the disk is
-    full, no more photos are written.
+    Several threads and processes may share the folder.
+
+    Entries that were used since this object was created are never deleted. If space is needed, the
+    least recently used of all other entries are deleted first. If the deletions do not free enough
+    space, or if the disk is full, no more photos are written.
 
     Args:
-        folder: The folder; it is created when the first photo is written.
-        mib: Size of all entries together, MiB.
+        folder: Path of the folder. The folder is created when the first photo is written.
+        mib: Largest size of all entries together, in MiB.
     """
 
     def __init__(self, folder: Path, mib: int) -> None:
@@ -87,19 +97,24 @@ class PhotoStore:
         self._limit = mib * 2**20
         self._begun = time() - _GRAIN
         self._used: int | None = None
-        # Entry that this store wrote or checked -> its last use. The value is valid as long as it
-        # equals the file time.
+        # Entry that this object has written or verified -> file time of its last use. If the file
+        # time has changed, the entry must be verified again.
         self._sound: dict[Path, int] = {}
         self._lock = Lock()
         self._open = mib > 0
 
     def holds(self, source: Storable) -> bool | None:
-        """Return True if this photo has a file, valid or not; None if the photo is never cached."""
+        """Return True if a file exists for this photo, whether valid or not.
+
+        Return None if the photo is never cached.
+        """
         origin = source.origin if self._open else None
         return None if origin is None else self._path(origin).is_file()
 
     def decoded(self, source: Storable) -> Decoded:
-        """Return the photo from its entry if the entry is valid; else decode and store it.
+        """Return the photo from its entry if the entry is valid.
+
+        If the entry is invalid, decode the photo and store the decoded photo.
 
         Raises:
             UserError: The photo is damaged.
@@ -145,7 +160,10 @@ class PhotoStore:
         self._sound[entry] = now
 
     def _close(self, why: str) -> None:
-        """Write no more photos in this run: photos are decoded again instead."""
+        """Write no more photos in this run.
+
+        From now on, missing photos are decoded again for each use.
+        """
         self._open = False
         _LOG.info("further photos are not stored in %s: %s", self._folder, why)
 
@@ -158,13 +176,16 @@ class PhotoStore:
         return fits and shutil.disk_usage(self._folder).free >= size + RESERVE
 
     def _made_room(self, size: int) -> int:
-        """Delete unused entries as far as needed, and return the bytes of the remaining entries."""
+        """Delete as many old entries as needed.
+
+        Return the total number of bytes of the remaining entries.
+        """
         entries = sorted(_entries(self._folder))
         used = sum(length for _, length, _ in entries)
         for last_used, length, path in entries:
             if used + size <= self._limit or last_used >= self._begun:
                 break
-            # Another process may have replaced the file first, or may hold the file open.
+            # Another process may already have deleted the file, or may have the file open.
             with suppress(OSError):
                 path.unlink()
                 used -= length
@@ -172,7 +193,10 @@ class PhotoStore:
 
 
 def _entries(folder: Path) -> Iterator[tuple[float, int, Path]]:
-    """Yield time of last use, bytes and path of each entry; deletes files of killed processes."""
+    """Yield the time of last use, the size and the path of each entry.
+
+    Delete files that killed processes left behind.
+    """
     with os.scandir(folder) as listing:
         for entry in listing:
             with suppress(OSError):
@@ -184,7 +208,10 @@ def _entries(folder: Path) -> Iterator[tuple[float, int, Path]]:
 
 
 def _packed(decoded: Decoded) -> list[bytes | memoryview]:
-    """Pack an entry: magic, CRC-32 of the data, pixels, and one bit for each pixel of a mask."""
+    """Return the parts of an entry as bytes.
+
+    The parts are a file signature, a CRC-32 checksum, the pixels, and one bit per pixel for a mask.
+    """
     image, mask = decoded
     pixels = image.contiguous().numpy().reshape(-1).data
     bits = b"" if mask is None else np.packbits(mask.numpy()).tobytes()
@@ -193,9 +220,9 @@ def _packed(decoded: Decoded) -> list[bytes | memoryview]:
 
 
 def _read(path: Path, width: int, height: int, sound: int | None) -> Decoded | None:
-    """Read the photo and mask of an entry; None if the entry is missing or invalid.
+    """Read the photo and the mask of an entry. Return None if the entry is missing or invalid.
 
-    The checksum is not verified if the entry was last used at `sound` [ns], because a check takes
+    If the file time equals `sound` [ns], the checksum is not verified again. The verification takes
     as long as reading.
     """
     head, pixels, bits = len(_MAGIC) + _SUM, 3 * width * height, -(-width * height // 8)
@@ -222,6 +249,6 @@ def _read(path: Path, width: int, height: int, sound: int | None) -> Decoded | N
 
 @cache
 def made_by() -> str:
-    """Return everything but the file that determines the bits of a decoded photo."""
+    """Return everything, except the file itself, that determines the pixels of a decoded photo."""
     names = ("pillow", "pycolmap")
     return f"{PIXELS_VERSION} {' '.join(f'{name} {version(name)}' for name in names)}"

@@ -1,4 +1,4 @@
-"""Photos that are decoded on demand, and the memory cache that holds them."""
+"""Photos that are decoded on demand, and the memory cache for decoded photos."""
 
 import os
 from collections import OrderedDict
@@ -28,36 +28,38 @@ from crossgrad_core.scene.photos.decode import (
 from crossgrad_core.scene.photos.photo_store import Decoded, PhotoStore, Storable, made_by
 from crossgrad_core.scene.photos.shapes import is_turned
 
-#: For the test, JPEG files are decoded at an eighth of their width and height. This still reads all
-#: data of the file.
+#: To test a JPEG file, decode the file at an eighth of its width and height. Decoding at an eighth
+#: of the size is faster, but still reads all data of the file.
 SMALLEST = 8
 _OPAQUE, _HALF = 255, 128
-#: Seconds to wait for a photo that another thread is decoding.
+#: Seconds that a thread waits for a photo while another thread decodes the photo.
 _PATIENCE = 0.5
-# Number of photos in the cache. It is larger than the number of views of one step, so that no photo
-# is decoded twice in one step.
+# Number of recently used photos in the cache. The number exceeds the number of views in a step, so
+# that a step decodes each photo only once.
 _LATEST = 16
-#: Photos with fewer pixels are decoded about as quickly as they are read from the disk cache.
+#: Photos with fewer pixels are not cached on disk, because decoding is about as fast as reading
+#: from the disk cache.
 _LARGE = 2_000_000
 
 
 @dataclass(frozen=True)
 class PhotoSource:
-    """How to decode a view's photo from its file.
+    """All information that is needed to decode a view's photo from its file.
 
     Attributes:
-        path: The photo.
-        width: Width of the photo in the pixels that its pose refers to.
-        height: Height of the photo in the pixels that its pose refers to.
-        orientation: The EXIF orientation that its pose refers to; 1 for the stored pixel grid.
-        mask: The mask file, or None.
-        alpha: True if the file may have transparent pixels.
-        background: RGB in [0, 1] behind transparent pixels; None if these pixels do not count.
-        distorted: Calibration for the undistortion, for the size `width` x `height`; None for a
-            pinhole camera.
-        target: (width, height) as trained.
-        reduction: Divisor of the file's width and height during decoding.
-        white: The value of white, if the file has 16 bits per channel.
+        path: Path of the photo.
+        width: Width of the photo in the orientation that its pose refers to, in pixels.
+        height: Height of the photo in the orientation that its pose refers to, in pixels.
+        orientation: The EXIF orientation that the pose refers to; 1 if the pose refers to the photo
+            as stored.
+        mask: Path of the mask; None without a mask.
+        alpha: True if the file may contain transparent pixels.
+        background: RGB in [0, 1] behind transparent pixels; None if transparent pixels are masked.
+        distorted: Calibration of the photo with size `width` x `height` before undistortion; None
+            for a pinhole camera.
+        target: Width and height of the training photo.
+        reduction: Number by which the file's width and height are divided during decoding.
+        white: Value of white in a file with 16 bits per channel.
     """
 
     path: Path
@@ -74,42 +76,47 @@ class PhotoSource:
 
     @property
     def may_mask(self) -> bool:
-        """True if some pixels may not count."""
+        """True if some pixels may be masked."""
         transparent = self.alpha and self.background is None
         blank = self.distorted is not None and not self.distorted.fills_frame
         return self.mask is not None or transparent or blank
 
     @property
     def undistorted_size(self) -> tuple[int, int]:
-        """(width, height) before resizing."""
+        """Width and height after undistortion, before resizing."""
         if self.distorted is None:
             return self.width, self.height
         return self.distorted.pinhole.width, self.distorted.pinhole.height
 
     @property
     def origin(self) -> str | None:
-        """Everything that determines the pixels; None if decoding is as fast as reading."""
+        """Text with everything that determines the pixels.
+
+        The text is None if reading from the cache would save no time.
+        """
         pixels = self.width * self.height * self.reduction**2
         if pixels < _LARGE or (self.target == (self.width, self.height) and not self.distorted):
             return None
         files = [self.path] if self.mask is None else [self.path, self.mask]
         try:
             facts = [os.stat(path) for path in files]
-        except OSError:  # The decoder reports the error later.
+        except OSError:  # If a file cannot be read, the decoder raises the error later.
             return None
         marks = [(f.st_size, f.st_mtime_ns, f.st_ctime_ns, f.st_ino) for f in facts]
         return f"{made_by()} {[str(path.absolute()) for path in files]} {marks} {self}"
 
     @property
     def decoded_bytes(self) -> int:
-        """Upper bound of the bytes of the decoded photo and a mask."""
+        """Upper bound on the memory of the decoded photo and its mask, in bytes."""
         return 4 * self.target[0] * self.target[1]
 
     def decode(self) -> Decoded:
-        """Decode the photo [H, W, 3] uint8 and its mask [H, W] bool; None if all pixels count.
+        """Decode the photo [H, W, 3] uint8 and its mask [H, W] bool.
+
+        The mask is None if all pixels are valid.
 
         Raises:
-            UserError: The photo or its mask is damaged or has changed its size.
+            UserError: The photo or its mask is damaged, or its size has changed.
         """
         rgb, alpha = decode_photo(self.path, self.reduction, self.white)
         rgb = turn(rgb, self.orientation)
@@ -130,7 +137,7 @@ class PhotoSource:
         return image, torch.from_numpy(resize(keep, *self.target) >= _HALF)
 
     def try_out(self) -> None:
-        """Test if the files can be decoded, in less time than `decode` needs.
+        """Test whether the photo and its mask can be decoded. A test takes less time than `decode`.
 
         Raises:
             UserError: The photo or its mask is damaged.
@@ -151,7 +158,10 @@ class PhotoSource:
             )
 
     def _decode_mask(self) -> Pixels | None:
-        """Decode the mask in the photo's size, 0 or 255; nearest neighbour if the sizes differ."""
+        """Decode the mask in the photo's size, with values 0 and 255.
+
+        If the mask and the photo differ in size, the nearest pixel of the mask is used.
+        """
         if self.mask is None:
             return None
         mask = decode_mask(self.mask)
@@ -162,7 +172,7 @@ class PhotoSource:
         return np.asarray(mask[rows[:, None], columns])
 
     def _undistort_mask(self, distorted: Calibration, keep: Pixels | None) -> Pixels | None:
-        """Undistort the mask; pixels outside the photo do not count."""
+        """Undistort the mask. Pixels outside the original photo are masked."""
         if keep is not None:
             keep = distorted.undistort(keep)
         if distorted.fills_frame:
@@ -170,21 +180,23 @@ class PhotoSource:
         return _both(keep, np.where(distorted.reached(), _OPAQUE, 0).astype(np.uint8))
 
 
-#: Type of the keys. Keys are hashable, and equal keys decode to the same pixels.
+#: Type of the cache keys. Keys must be hashable, and photos with equal keys must have equal pixels.
 Key = TypeVar("Key", bound=Storable)
 
 
 class PhotoCache(Generic[Key]):
-    """A cache of decoded photos in bounded memory; it may be used from several threads.
+    """A cache of decoded photos in limited memory. Several threads may use the cache.
 
-    Training uses all photos again and again. A least-recently-used cache would almost never contain
-    the next photo if the set is slightly larger than the memory. Therefore old photos are kept, and
-    new photos replace only the latest few photos that are not expected next. If the set is twice as
-    large as the memory, about half of the requests find their photo in memory.
+    Training uses all photos again and again, in changing order. If the photos need slightly more
+    memory than the limit, a least-recently-used cache would almost never contain the next photo. In
+    this cache, old photos stay in memory. A new photo replaces one of the latest few photos, if
+    possible a photo that is not expected next. If the photos need twice as much memory as the
+    limit, about half of the requests find their photo in memory.
 
     Args:
-        mib: Memory for decoded photos and masks, MiB. The latest photo is always kept.
-        store: Disk cache of the photos; None decodes their files.
+        mib: Memory for decoded photos and masks, in MiB. The latest photo is always stored, even if
+            the photo exceeds this limit.
+        store: Disk cache of the photos; None to use no disk cache.
     """
 
     def __init__(self, mib: int, store: PhotoStore | None = None) -> None:
@@ -199,22 +211,29 @@ class PhotoCache(Generic[Key]):
 
     @property
     def used(self) -> int:
-        """Bytes of the decoded photos and masks."""
+        """Bytes of all decoded photos and masks in memory."""
         return self._used
 
     def expect(self, sources: Iterable[Key]) -> None:
-        """Announce the photos that will be requested next; these photos are dropped last."""
+        """Announce the photos that will be requested next.
+
+        The announced photos are removed from memory last.
+        """
         self._expected = frozenset(sources)
 
     def holds(self, source: Key) -> bool:
-        """Return True if a photo is in memory or is being decoded by some thread."""
+        """Return True if a photo is in memory or if a thread is decoding it."""
         return source in self._kept or source in self._latest or source in self._under_way
 
     def get(self, source: Key) -> Decoded:
-        """Return the decoded photo and mask of `source`; both are shared and must not be changed.
+        """Return the decoded photo and mask of `source`.
 
-        If another thread is decoding the photo, this call waits only for a short time. The decoding
-        thread has low priority and may make no progress while other programs use the cores.
+        The photo and the mask are shared, so the caller must not change them.
+
+        If another thread is decoding the photo, this call first waits for a short time. If the
+        photo is still missing after the wait, this call decodes the photo itself. The wait is
+        limited, because the other thread has low priority and may not get a core while other
+        programs run.
         """
         over, waited = Event(), False
         while True:
@@ -237,7 +256,10 @@ class PhotoCache(Generic[Key]):
                 over.set()
 
     def prepare(self, source: Key) -> bool:
-        """Write the photo to the disk cache; return False if no photo is written to disk."""
+        """Write the photo to the disk cache, unless the cache already contains the photo.
+
+        Return False if this photo is never cached on disk.
+        """
         there = None if self._store is None else self._store.holds(source)
         if there is False:
             self._decoded(source)
@@ -258,7 +280,10 @@ class PhotoCache(Generic[Key]):
             self._kept[key] = decoded
 
     def _dropped(self) -> Decoded:
-        """Remove the oldest photo that is not expected, but never the latest photo."""
+        """Remove a photo that is not expected, the oldest of the latest photos first.
+
+        The newest photo is never removed.
+        """
         *others, _ = self._latest
         idle = next((key for key in others if key not in self._expected), None)
         if idle is None and self._kept:
@@ -268,7 +293,10 @@ class PhotoCache(Generic[Key]):
 
 @dataclass(frozen=True, eq=False)
 class FilePhoto(Photo):
-    """A photo on disk, decoded on demand into the scene's cache."""
+    """A photo in a file.
+
+    The photo is decoded when it is requested, and the scene's cache stores the decoded photo.
+    """
 
     source: PhotoSource
     cache: PhotoCache[PhotoSource]

@@ -1,4 +1,4 @@
-"""Threads that decode photos before they are needed, and a check that decodes each photo once."""
+"""Threads that decode photos before a step needs them, and a check that decodes each photo once."""
 
 import logging
 import os
@@ -15,19 +15,19 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.scene.photos.photos import FilePhoto
 from crossgrad_core.scene.wording import name_some
 
-#: Number of photos that are decoded at the same time. More photos would use more memory.
+#: Number of photos that are decoded in parallel. A larger number would need more memory.
 AT_ONCE = 2
-#: Seconds that the end of a run waits for the photos that are still being decoded.
+#: Seconds that the end of a run waits for photos that are still being decoded.
 _PATIENCE = 5.0
 _LEAST_URGENT = 19
 _LOG = logging.getLogger(__name__)
 
 
 class PhotosAhead:
-    """Background threads that decode the photos of the next steps, and every other photo once.
+    """Background threads that decode the photos of the next steps, and all other photos once.
 
-    With enough cores the training clock never waits for a photo, and a damaged photo is found early
-    instead of at its first use. The order of decoding never changes the result of a run.
+    With enough cores, training never waits for a photo. A damaged photo is found early, before a
+    step needs the photo. The order of decoding does not affect the results of a run.
     """
 
     def __init__(self) -> None:
@@ -42,14 +42,15 @@ class PhotosAhead:
     def at_work(
         self, views: Sequence[View], report: Callable[[Exception], None], *, keep: bool
     ) -> Iterator[None]:
-        """Decode photos in the background while the block runs.
+        """Inside the block, decode photos in background threads.
 
         Args:
-            views: All views. Each photo is decoded once, even if no step requests it.
-            report: Called from another thread with the first error among these views; the remaining
-                views are then not decoded.
-            keep: True if all photos fit into memory. Otherwise photos that are not expected are
-                written to the disk cache, or decoded only to test them.
+            views: All views of the scene. Each photo is decoded once, even if no step requests the
+                photo.
+            report: Function that another thread calls with the first error. After the error, the
+                remaining photos are not decoded.
+            keep: True if all decoded photos fit into memory. If False, photos of no announced view
+                are only written to the disk cache, or only tested.
         """
         self._unseen, self._report, self._keep = iter(views), report, keep
         self._at_work = True
@@ -67,18 +68,22 @@ class PhotosAhead:
 
     @property
     def useful(self) -> bool:
-        """True if it helps to announce the next views; False once all photos are in memory."""
+        """True if announcing the next views can save time; False after all photos are in memory."""
         return self._at_work
 
     def expect(self, views: Sequence[View]) -> None:
-        """Announce the next views in drawing order; this replaces the views announced before."""
+        """Announce the next views, in the order in which steps use these views.
+
+        The new list of views replaces all earlier announcements.
+        """
         photos = [view.photo for view in views if isinstance(view.photo, FilePhoto)]
         if not photos:
             return
         cache, size, fitting = photos[0].cache, 0, list[FilePhoto]()
         for photo in photos:
             size += photo.source.decoded_bytes
-            # Leave out later photos, because they would push earlier photos out of the cache.
+            # Leave out further photos, because further photos would remove earlier photos from the
+            # cache.
             if size <= cache.limit // 2:
                 fitting.append(photo)
         cache.expect(photo.source for photo in fitting)
@@ -87,7 +92,7 @@ class PhotosAhead:
             self._changed.notify_all()
 
     def taken_cpu(self) -> float:
-        """Return the CPU seconds of photos decoded since the previous call."""
+        """Return the CPU seconds that the threads spent on decoding since the previous call."""
         with self._changed:
             taken, self._cpu = self._cpu, 0.0
         return taken
@@ -101,7 +106,7 @@ class PhotosAhead:
                 self._cpu += thread_time() - begun
 
     def _next(self) -> Callable[[], None] | None:
-        """Return the next job; None if no job is left."""
+        """Return the next job for a thread. Return None if no job is left."""
         with self._changed:
             while self._at_work:
                 while self._expected:
@@ -112,7 +117,7 @@ class PhotosAhead:
                 if view is not None:
                     return partial(self._see, view)
                 if self._keep:
-                    self._at_work = False  # All photos are in memory.
+                    self._at_work = False  # All photos are in memory now.
                     self._changed.notify_all()
                 else:
                     self._changed.wait()
@@ -122,15 +127,17 @@ class PhotosAhead:
         try:
             decode(view, keep=self._keep)
         except MemoryError:
-            self._unseen = iter(())  # Stop prefetching, because training needs the memory more.
-        except Exception as error:  # Photos of a plugin may raise any exception.
+            self._unseen = iter(())  # Stop decoding in advance, because training needs the memory.
+        except Exception as error:  # The photos of a plugin may raise any exception.
             self._unseen = iter(())
             report, self._report = self._report, _ignore
             report(error)
 
 
 def decode(view: View, *, keep: bool) -> None:
-    """Decode a view's photo into memory, else into the disk cache, else only to test it.
+    """Decode a view's photo into memory.
+
+    Without `keep`, decode the photo into the disk cache, or only test the photo.
 
     Raises:
         UserError: The photo cannot be decoded.
@@ -144,39 +151,43 @@ def decode(view: View, *, keep: bool) -> None:
 
 
 def _get_quietly(photo: FilePhoto) -> None:
-    with suppress(Exception):  # The later request for this photo reports the error.
+    # The training step reports the error when it requests the photo later.
+    with suppress(Exception):
         photo.cache.get(photo.source)
 
 
 def _ignore(error: Exception) -> None:
-    """Ignore an error, because only the first error is reported."""
+    """Do nothing, because only the first error is reported."""
 
 
 def _give_way() -> None:
-    """Give training priority over this thread, on systems with a priority per thread."""
+    """Give this thread a lower priority than training, on systems with priorities for threads."""
     if sys.platform == "linux":
         with suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, get_native_id(), _LEAST_URGENT)
 
 
 def fits(scene: Scene, mib: int) -> bool:
-    """Return True if all decoded photos of a scene fit into memory, so none is decoded twice."""
+    """Return True if all decoded photos of a scene fit into memory.
+
+    If all decoded photos fit into memory, no photo is decoded twice.
+    """
     pixels = sum(view.camera.width * view.camera.height for view in scene.views)
-    return 4 * pixels <= mib * 2**20  # Three bytes for RGB and one byte for a mask
+    return 4 * pixels <= mib * 2**20  # Three bytes for RGB, and one byte for a mask.
 
 
 def check_photos(views: Sequence[View], *, keep: bool, whole: bool = False) -> None:
-    """Decode the photos and masks of some views to find damaged files.
+    """Decode the photos and masks of some views, to find damaged files.
 
     Args:
-        views: The views.
-        keep: True if there is memory to keep the decoded photos.
-        whole: True to decode all photos completely, even if there is no memory to keep the decoded
-            photos. If False and there is no memory, files are only tested, JPEG files at an eighth
-            of their size.
+        views: The views whose photos are checked.
+        keep: True if the memory suffices to keep the decoded photos.
+        whole: True to decode all photos completely, even if the decoded photos cannot be kept in
+            memory. If both `whole` and `keep` are False, files are only tested; JPEG files are
+            decoded at an eighth of their size.
 
     Raises:
-        UserError: Some photos cannot be decoded; the message names them.
+        UserError: Some photos cannot be decoded. The message names the photos.
     """
     if not views:
         return

@@ -1,8 +1,9 @@
-"""Sizes of photos and masks: scaled copies, turned photos, photos too large to decode.
+"""Compare the sizes of photos and masks, and choose reduced sizes for photos that are too large.
 
-A JPEG file holds blocks of 8 x 8 frequencies. For a reduced size the decoder uses only the lowest
-4 x 4, 2 x 2 or 1 x 1 frequencies, so the full photo is never in memory. Progressive files do not
-benefit, because their decoder keeps all frequencies in memory.
+A JPEG file stores each block of 8 x 8 pixels as 8 x 8 frequencies. For a reduced size, the decoder
+uses only the lowest 4 x 4, 2 x 2 or 1 x 1 frequencies. With fewer frequencies, the full photo is
+never in memory. For progressive JPEG files, a reduced size saves no memory, because the decoder
+stores all frequencies.
 """
 
 from pathlib import Path
@@ -18,14 +19,20 @@ _REDUCTIONS = (8, 4, 2)
 
 
 def is_scaled(size: Size, of: Size) -> bool:
-    """Return True if a size is a scaled copy of another size, each side within one pixel."""
+    """Return True if one size is the other size times a factor.
+
+    Each side may differ by one pixel.
+    """
     least = max((side - 1) / other for side, other in zip(size, of, strict=True))
     most = min((side + 1) / other for side, other in zip(size, of, strict=True))
     return least <= most
 
 
 def is_turned(size: Size, photo: Size) -> bool | None:
-    """Return True if a mask fits its photo only after a quarter turn; None if it never fits."""
+    """Return True if a mask matches its photo only after a quarter turn.
+
+    Return None if the mask does not match in any orientation.
+    """
     turned = photo[::-1]
     if size in {photo, turned}:
         return size != photo
@@ -33,10 +40,10 @@ def is_turned(size: Size, photo: Size) -> bool | None:
 
 
 def check_mask(path: Path, photo: Size, *, may_turn: bool) -> None:
-    """Refuse a mask that is too large, or that does not have the proportions of its photo.
+    """Raise an error if a mask is too large, or if its aspect ratio differs from its photo.
 
     Raises:
-        UserError: The mask is too large, has other proportions, or its file is damaged.
+        UserError: The mask is too large, its aspect ratio is wrong, or its file is damaged.
     """
     header = read_header(path)
     if header.width * header.height > pillow.MOST_PIXELS:
@@ -59,14 +66,14 @@ def check_mask(path: Path, photo: Size, *, may_turn: bool) -> None:
 
 
 def choose_reduction(path: Path, header: PhotoHeader, max_size: int | None) -> int:
-    """Choose the divisor of each side of a photo during decoding: 1, 2, 4 or 8.
+    """Choose the number by which both sides of a photo are divided during decoding: 1, 2, 4 or 8.
 
-    The divisor is 1 for all photos that can be decoded at once. For larger photos, it is the
-    largest divisor that leaves `max_size` pixels on the longest side. If there is no such divisor,
-    it is the smallest possible divisor.
+    The number is 1 for all photos that are small enough to be decoded completely. For larger
+    photos, the number is the largest number that leaves at least `max_size` pixels on the longest
+    side. If no number leaves at least `max_size` pixels, the smallest possible number is used.
 
     Raises:
-        UserError: The photo is too large; the message suggests a remedy.
+        UserError: The photo is too large. The message suggests a remedy.
     """
     pixels = header.width * header.height
     if pixels <= pillow.MOST_PIXELS:
@@ -79,7 +86,7 @@ def choose_reduction(path: Path, header: PhotoHeader, max_size: int | None) -> i
 
 
 def too_large(path: Path, header: PhotoHeader) -> UserError:
-    """Return the error for a photo that cannot be decoded at once."""
+    """Return the error for a photo that is too large to be decoded completely."""
     way = (
         "--max-size N, such as --max-size 4000, decodes it at a reduced size"
         if header.reducible

@@ -1,4 +1,4 @@
-"""The consistency check of a scene before training."""
+"""Check before training whether the poses, points and photos of a scene match."""
 
 import logging
 from collections.abc import Iterator, Sequence
@@ -21,36 +21,38 @@ from crossgrad_core.scene.self_check.evidence import Floats, Integers, Pixels, p
 from crossgrad_core.scene.self_check.verdict import Cause, Verdict, verdict_of
 from crossgrad_core.scene.wording import count, name_some
 
-#: Poses are equal if their elements differ by less than this, in local units.
+#: Two poses are equal if all their elements differ by less than this number, in local units.
 _SAME_POSE: Final = 1e-9
-#: Points beyond this many times the median distance from the cameras count as infinitely far.
+#: A point counts as infinitely far if its distance from the cameras is this many times the median
+#: distance.
 _INFINITE: Final = 1e4
-#: Photos are compared as small copies with this many pixels in either direction.
+#: Photos are compared as small copies with this number of pixels in each direction.
 _SMALL: Final = 16
-#: Two photos are almost equal if their mean difference is below this, in levels of 255.
+#: Two photos are almost equal if the mean difference of their pixels is below this number of levels
+#: of 255.
 _ALMOST: Final = 0.5
-#: A photo is blurred below this share of the median sharpness. It is dark or bright if it differs
-#: from the median brightness by more than this many stops.
+#: A photo counts as blurred if its sharpness is below this share of the median sharpness. A photo
+#: counts as dark or bright if its brightness differs from the median by more than `_STOPS` stops.
 _BLURRED: Final = 0.15
 _STOPS: Final = 4.0
-#: With fewer photos than this, no median is computed.
+#: With fewer photos, no median is computed.
 _FEWEST_PHOTOS: Final = 5
-#: Sharpness is the difference of neighbouring pixels divided by the difference of pixels at this
-#: distance.
+#: The sharpness is the difference of neighbouring pixels, divided by the difference of pixels at
+#: this distance.
 _APART: Final = 6
 
 
 class Sketches:
-    """Samples of photos on a pixel grid, for comparing photos with each other.
+    """Small copies of photos with their sharpness and brightness, for comparing photos.
 
     Args:
-        images: [H, W, 3] photos.
+        images: The photos [H, W, 3].
 
     Attributes:
-        small: [V, 16, 16, 3] pixels, levels of 255.
-        sharpness: [V] differences between neighbouring pixels divided by differences between more
-            distant pixels; NaN if the distant pixels hardly differ.
-        light: [V] mean level of the pixels, 0 to 255.
+        small: [V, 16, 16, 3] pixels of the small copies, in levels of 255.
+        sharpness: [V] differences of neighbouring pixels, divided by differences of more distant
+            pixels. NaN if the distant pixels hardly differ.
+        light: [V] mean level of all pixels in a small copy, 0 to 255.
     """
 
     def __init__(self, images: Sequence[NDArray[np.uint8]]) -> None:
@@ -65,7 +67,11 @@ class Sketches:
 
 @cache
 def _grid(height: int, width: int) -> Integers:
-    """Return flat pixel indices [3, 16, 16]: on a grid, next to it, and farther to the right."""
+    """Return one-dimensional pixel indices [3, 16, 16].
+
+    The indices belong to a grid, to the right neighbours of its pixels, and to pixels farther to
+    the right.
+    """
     shares = (np.arange(_SMALL) + 0.5) / _SMALL
     down = (shares * height).astype(np.int64)
     right = (shares * max(width - _APART, 1)).astype(np.int64)
@@ -76,11 +82,11 @@ def _grid(height: int, width: int) -> Integers:
 def findings_of(
     scene: Scene, images: Sequence[NDArray[np.uint8]], names: Sequence[str]
 ) -> Iterator[str]:
-    """Yield notes on unusual properties of a scene.
+    """Yield notes about unusual properties of a scene.
 
     Args:
         scene: The scene.
-        images: [H, W, 3] photos that were checked.
+        images: The photos [H, W, 3] that were checked.
         names: Names of the photos.
     """
     poses = np.stack([view.camera.world_to_camera.numpy() for view in scene.views])
@@ -142,7 +148,7 @@ def _listed(which: NDArray[np.bool_], names: Sequence[str]) -> str:
 
 
 def _repeated(rows: NDArray[np.float64], names: Sequence[str]) -> list[str]:
-    """Return the names of the rows that equal an earlier row."""
+    """Return the names of all rows that are equal to an earlier row."""
     _, first, numbers = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     firsts = first[numbers.ravel()]
     return [name for i, name in enumerate(names) if firsts[i] != i]
@@ -153,14 +159,16 @@ _BYTES_OF_A_PIXEL: Final = 4
 
 
 def checked(scene: Scene, path: Path, *, cache_mib: int, accept: bool = False) -> Scene:
-    """Check a scene and return it with notes about contradictions and with the results in `check`.
+    """Check a scene.
+
+    The returned scene contains notes about contradictions, and the results in `check`.
 
     Args:
         scene: The scene.
-        path: The folder of the scene, for messages.
-        cache_mib: Memory for decoded photos. If the scene needs more, only evenly spaced photos are
-            checked.
-        accept: Continue even if the scene as a whole is contradictory.
+        path: Folder of the scene, for messages.
+        cache_mib: Memory for decoded photos, in MiB. If the photos need more memory, only evenly
+            spaced photos are checked.
+        accept: True to continue even if the scene as a whole is contradictory.
 
     Raises:
         UserError: The scene as a whole is contradictory.
@@ -191,7 +199,10 @@ def checked(scene: Scene, path: Path, *, cache_mib: int, accept: bool = False) -
 
 
 def _is_decoded(pixels: Pixels, view: int) -> bool:
-    """Decode a photo; return False if this fails. Later users of the photo report the error."""
+    """Decode a photo.
+
+    Return False if the decoding fails. Code that needs the photo later reports the error.
+    """
     try:
         pixels(view)
     except UserError:
@@ -200,7 +211,7 @@ def _is_decoded(pixels: Pixels, view: int) -> bool:
 
 
 def _looked_at(scene: Scene, cache_mib: int) -> Sequence[int]:
-    """Return all views, or as many evenly spaced views as fit into memory."""
+    """Return all views or, if their photos do not fit into memory, evenly spaced views."""
     number = len(scene.views)
     if fits(scene, cache_mib):
         return range(number)

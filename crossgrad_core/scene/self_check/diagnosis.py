@@ -1,4 +1,7 @@
-"""Diagnosis of a contradictory scene: the trial change that repairs the scene names the cause."""
+"""Find the cause of a contradictory scene.
+
+If a trial change makes the scene consistent, this change shows the cause.
+"""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -16,17 +19,19 @@ from crossgrad_core.scene.self_check.evidence import (
     Rig,
 )
 
-#: Number of cameras that are used in trials.
+#: Largest number of cameras in trials.
 MOST_CAMERAS: Final = 12
-#: A camera without tracks counts as seeing nothing if fewer points are in its frame.
+#: A camera without tracks gets a score of 0 if fewer points than this number are inside its photo.
 _FEWEST_UNTRACKED: Final = 3 * FEWEST
-#: A later trial must score higher by this much than an earlier, simpler trial.
+#: A later trial replaces an earlier, simpler trial only if its score is higher by more than this
+#: number.
 _CLEARLY: Final = 0.03
-#: A changed scene must score higher by this much than the unchanged scene.
+#: A small change counts as an improvement if the score increases by more than this number.
 _PROBED: Final = 0.01
-#: Number of times that the step of a search is halved.
+#: Number of times that a search halves its step.
 _ROUNDS: Final = 4
-#: Minimum score of a consistent scene, and minimum gain of a change that repairs a scene.
+#: `LEAST`: minimum score of a consistent scene. `GAINED`: minimum gain of a change that repairs a
+#: scene.
 LEAST: Final = 0.35
 GAINED: Final = 0.25
 Change: TypeAlias = Callable[[Rig], Rig]
@@ -34,12 +39,12 @@ _POSES: Final = "convert the poses of the model to OpenCV axes (x right, y down,
 _PHOTOS: Final = "restore the photos that the poses were estimated from"
 _FLIP: Final = np.diag([1.0, -1.0, -1.0])
 _AXES: Final = "xyz"
-#: Step of the logarithm of a factor. Step and maximum offset of the principal point, as shares of
-#: the photo.
+#: Step of a search for the logarithm of a factor. Step and maximum offset of the principal point,
+#: as shares of the photo's width or height.
 _FACTOR: Final = 0.04
 _OFF: Final = 0.05
 _MOST_OFF: Final = 0.5
-#: Rotations and reflections of a photo around its centre.
+#: Rotations and reflections of a photo about its centre.
 _TURNS: Final = (
     ("the photos are mirrored left to right", [[-1.0, 0.0], [0.0, 1.0]]),
     ("the photos are mirrored top to bottom", [[1.0, 0.0], [0.0, -1.0]]),
@@ -53,12 +58,12 @@ _TURNS: Final = (
 
 @dataclass(frozen=True)
 class Trial:
-    """A change of a rig.
+    """A change of cameras or points that may make a contradictory scene consistent.
 
     Attributes:
-        cause: The defect of the scene if the change repairs it.
-        todo: The remedy for the user.
-        change: The change.
+        cause: The defect of the scene, if this change repairs the scene.
+        todo: The remedy that is suggested to the user.
+        change: Function that applies the change.
     """
 
     cause: str
@@ -68,12 +73,12 @@ class Trial:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The trial that fits best.
+    """The trial with the best score, and the score without any change.
 
     Attributes:
-        before: Score of the unchanged photos, in [0, 1].
-        after: Score after the change.
-        trial: The change; None if no change is better.
+        before: Score without a change, in [0, 1].
+        after: Score after the change, in [0, 1].
+        trial: The trial; None if no trial improves the score.
     """
 
     before: float
@@ -82,12 +87,15 @@ class Diagnosis:
 
     @property
     def repairs(self) -> bool:
-        """True if the photos agree after the change and did not agree before."""
+        """True if photos and points agree only after the change."""
         return self.after >= LEAST and self.after >= self.before + GAINED
 
 
 def scores(agreement: Agreement, *, tracked: bool) -> Floats:
-    """Return scores [V] in [0, 1]: colour correlation, with tracks times the share in frame."""
+    """Return a score [V] in [0, 1] for each camera: the colour correlation.
+
+    With tracks, the correlation is multiplied by the share of points inside the photo.
+    """
     correlation = np.maximum(np.nan_to_num(agreement.correlation), 0.0)
     if tracked:
         return np.asarray(correlation * np.nan_to_num(agreement.share))
@@ -95,19 +103,19 @@ def scores(agreement: Agreement, *, tracked: bool) -> Floats:
 
 
 def some(cameras: Integers, most: int = MOST_CAMERAS) -> Integers:
-    """Return at most `most` cameras, evenly spaced."""
+    """Return at most `most` of the cameras, evenly spaced."""
     every = np.linspace(0, len(cameras) - 1, min(len(cameras), most))
     return cameras[every.round().astype(np.int64)]
 
 
 @dataclass(frozen=True)
 class Search:
-    """A change with one or two unknown numbers.
+    """A change with one or two unknown numbers, for example a factor of the focal length.
 
     Attributes:
-        values: [N, D] the numbers that are tried first.
-        step: Distance between neighbouring values.
-        trial: Makes the trial for D numbers.
+        values: [N, D] the N combinations of D numbers that are tried first.
+        step: Distance between neighbouring combinations in `values`.
+        trial: Function that makes a trial from D numbers.
     """
 
     values: Floats
@@ -116,23 +124,23 @@ class Search:
 
 
 class Bench:
-    """A test of changes on some cameras of the evidence."""
+    """A test of trials on some cameras of the evidence."""
 
     def __init__(self, evidence: Evidence, cameras: Integers) -> None:
         self._evidence = evidence.chosen(some(cameras))
         self.before = self.score(self._evidence.rig)
 
     def score(self, rig: Rig) -> float:
-        """Return the mean score of the cameras in a rig."""
+        """Return the mean score of all cameras in a rig."""
         return float(scores(self._evidence.agreement(rig), tracked=self._evidence.tracked).mean())
 
     def tried(self, trial: Trial) -> float:
-        """Return the mean score after a change."""
+        """Return the mean score after the change of a trial."""
         with np.errstate(all="ignore"):
             return self.score(trial.change(self._evidence.rig))
 
     def is_off(self) -> bool:
-        """Return True if a small change makes the photos agree better."""
+        """Return True if some small change of the cameras raises the score."""
         evidence = self._evidence
         first, *others = [probe.change(evidence.rig) for probe in probes()]
         rows = np.tile(evidence.rows, (1 + len(others), 1))
@@ -143,7 +151,7 @@ class Bench:
         return bool(mean_scores.max() > self.before + _PROBED)
 
     def diagnosis(self) -> Diagnosis:
-        """Return the change with the best score; likely changes are tried first."""
+        """Return the trial with the best score. Common mistakes are tried before rare mistakes."""
         best = self.best(likely())
         if not best.repairs:
             for search in searches():
@@ -151,14 +159,17 @@ class Bench:
         return best if best.repairs else self.best(other_axes(), best)
 
     def best(self, trials: Iterable[Trial], found: Diagnosis | None = None) -> Diagnosis:
-        """Return the best of some trials, or `found` if no trial is better."""
+        """Return the best of several trials, or `found` if no trial is better."""
         found = found or Diagnosis(self.before, self.before, None)
         for trial in trials:
             found = _better(found, self.tried(trial), trial)
         return found
 
     def _searched(self, search: Search) -> tuple[float, Trial]:
-        """Search the best numbers: try the given values, then refine the best with halved steps."""
+        """Search for the numbers with the best score.
+
+        Try all given values, then refine the best value with halved steps.
+        """
         tried = [self.tried(search.trial(value)) for value in search.values]
         best, score, step = search.values[int(np.argmax(tried))], max(tried), search.step
         for _ in range(_ROUNDS):
@@ -181,7 +192,7 @@ def turns() -> Iterator[Trial]:
 
 
 def likely() -> Iterator[Trial]:
-    """Yield trials for common mistakes."""
+    """Yield trials that correct common mistakes."""
     yield Trial(
         "the poses have OpenGL axes (y up, z backward)",
         f"{_POSES}: negate the second and third row of each world-to-camera matrix",
@@ -208,7 +219,7 @@ def likely() -> Iterator[Trial]:
 
 
 def other_axes() -> Iterator[Trial]:
-    """Yield trials for all other axes of points and of cameras."""
+    """Yield trials with all other orders and signs of the axes, for points and for cameras."""
     for matrix, text in _signed_axes():
         yield Trial(
             f"the points have other axes than the poses: ({text}) of the points fit",
@@ -222,7 +233,10 @@ def other_axes() -> Iterator[Trial]:
 
 
 def searches() -> Iterator[Search]:
-    """Yield changes with numbers: logarithms of factors, then shares of width and height."""
+    """Yield searches for unknown numbers.
+
+    The unknown numbers are logarithms of factors, then offsets as shares of width and height.
+    """
     for make, most in ((_focal, 5.0), (_scaled, 100.0), (_resized, 10.0)):
         steps = np.arange(-np.log(most), np.log(most), _FACTOR)
         yield Search(steps[:, None], _FACTOR, _by_logarithm(make))
@@ -232,7 +246,10 @@ def searches() -> Iterator[Search]:
 
 
 def probes() -> Iterator[Trial]:
-    """Yield small changes of the numeric parameters; a correct scene scores best unchanged."""
+    """Yield small changes of the numeric camera parameters.
+
+    In a correct scene, no small change raises the score.
+    """
     for make in (_focal, _scaled):
         yield from (make(value) for value in (0.93, 1.07))
     for value in (-0.04, 0.04):
@@ -259,7 +276,10 @@ def _with_points(matrix: Floats) -> Change:
 
 
 def _signed_axes() -> Iterator[tuple[Floats, str]]:
-    """Yield all permutations and sign changes of the axes except the identity, with a name."""
+    """Yield all permutations and sign changes of the axes, each with a description.
+
+    The identity is left out.
+    """
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):
             matrix = np.zeros((3, 3))
@@ -270,7 +290,7 @@ def _signed_axes() -> Iterator[tuple[Floats, str]]:
 
 
 def _inverted() -> Iterator[Trial]:
-    """Yield trials for poses that are inverse, completely or in part."""
+    """Yield trials that correct poses which are inverted completely or in part."""
     cause = "the poses are camera-to-world, but world-to-camera is expected"
     todo = "invert the 4 x 4 matrix of each pose in the model"
     for camera_axes, text in ((np.eye(3), ""), (_FLIP, ", in OpenGL axes")):
@@ -320,7 +340,7 @@ def _placed(rig: Rig, rotations: Floats, centers: Floats) -> Rig:
 
 
 def _reordered(order: tuple[int, ...]) -> Change:
-    """Return a change that reads the quaternions (w, x, y, z) in another order."""
+    """Return a change that interprets the quaternions (w, x, y, z) in another component order."""
 
     def change(rig: Rig) -> Rig:
         from scipy.spatial.transform import Rotation
@@ -362,8 +382,8 @@ def _scaled(factor: float) -> Trial:
     return Trial(
         f"points and camera positions have different units: {factor:.3g} times the points fit",
         "write points and camera positions in the same units",
-        # Scaling the depth gives the same image as scaling the points. Each camera may have its own
-        # factor.
+        # Dividing the translations has the same effect on the image as multiplying the points.
+        # Dividing the translations also allows a different factor for each camera.
         lambda rig: replace(rig, translations=rig.translations / factor),
     )
 

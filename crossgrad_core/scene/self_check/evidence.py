@@ -1,6 +1,6 @@
-"""The agreement of photos with points: share of points in frame, correlation of colours.
+"""Measure how well photos agree with points: points inside the photo, and colour correlation.
 
-Cameras and points are arrays in input coordinates, so that trials can change them.
+Cameras and points are stored as arrays in input coordinates, so that trials can change them.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,45 +15,46 @@ from crossgrad_core.contract.scene import Scene
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
-#: The orientation of unchanged photos, which are neither rotated nor mirrored.
+#: Orientation of photos that are neither rotated nor mirrored.
 UPRIGHT: Final = np.eye(2)
-#: With fewer observations than this, no correlation is computed.
+#: With fewer observations than this number, no correlation is computed.
 FEWEST: Final = 8
-#: Minimum number of observations if the colours of points come from other photos.
+#: Minimum number of observations if the colours of points are taken from other photos.
 FEWEST_OF_PHOTOS: Final = 24
-#: Maximum number of observed points per photo.
+#: Largest number of observed points for each photo.
 MOST_OBSERVED: Final = 64
-#: Maximum number of points per camera in trials.
+#: Largest number of points for each camera in trials.
 MOST_TRIED: Final = 2_000
-#: Minimum number of points that are tested in each photo without tracks.
+#: Minimum number of points that are tested in each photo if the views have no tracks.
 _TESTED: Final = 1_500
-#: A point is hidden if another point in its cell is nearer by this factor.
+#: A point is hidden if another point in its image cell is nearer by at least this factor.
 _HIDES: Final = 1.15
-#: Number of points per cell of the depth test, and maximum number of cells in either direction.
+#: The depth test divides a photo into cells. `_IN_A_CELL`: mean number of points in a cell.
+#: `_CELLS`: largest number of cells along each image side.
 _IN_A_CELL, _CELLS = 6, 64
-#: Colours with a smaller spread, in levels of 255, cannot be compared.
+#: Colours cannot be compared if their standard deviation is below this number of levels of 255.
 FLAT: Final = 4.0
 Booleans: TypeAlias = NDArray[np.bool_]
 Photo: TypeAlias = tuple[NDArray[np.uint8], Booleans | None]
-#: Function that decodes the photo of a view. It returns the pixels [H, W, 3] uint8 and, if some
-#: pixels are masked, the mask [H, W] bool.
+#: Function that decodes the photo of a view. The function returns the pixels [H, W, 3] uint8 and,
+#: if some pixels are masked, the mask [H, W] bool.
 Pixels: TypeAlias = Callable[[int], Photo]
 
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Cameras, and the points of their scene.
+    """The cameras and the points of a scene.
 
     Attributes:
-        rotations: [V, 3, 3] world to camera.
-        translations: [V, 3] world to camera, input units.
-        focal: [V, 2] pixels.
-        principal: [V, 2] pixels.
-        sizes: [V, 2] width and height in pixels.
-        points: [P, 3] input units.
-        photos: [V] the view whose photo is compared with each camera.
-        count: Number of photos of the scene.
-        turn: [2, 2] matrix that turns or mirrors the photos around their centre.
+        rotations: [V, 3, 3] rotations from world to camera.
+        translations: [V, 3] translations from world to camera, in input units.
+        focal: [V, 2] focal lengths in pixels.
+        principal: [V, 2] principal points in pixels.
+        sizes: [V, 2] widths and heights of the photos in pixels.
+        points: [P, 3] points in input units.
+        photos: [V] index of the view whose photo is compared with each camera.
+        count: Number of photos in the scene.
+        turn: [2, 2] matrix that rotates or mirrors all photos about their centres.
     """
 
     rotations: Floats
@@ -68,7 +69,7 @@ class Rig:
 
     @classmethod
     def of(cls, scene: Scene) -> "Rig":
-        """Make the rig of a scene."""
+        """Create the rig of a scene."""
         cameras = [view.camera for view in scene.views]
         poses = np.stack([camera.world_to_camera.numpy() for camera in cameras])
         rotations = poses[:, :3, :3]
@@ -86,7 +87,10 @@ class Rig:
         )
 
     def chosen(self, views: Sequence[int] | Integers) -> "Rig":
-        """Return the rig with some of its cameras, which keep their photos."""
+        """Return a rig that contains only some of the cameras.
+
+        Each camera is still compared with its photo.
+        """
         rows = np.asarray(views, dtype=np.int64)
         return replace(
             self,
@@ -99,7 +103,10 @@ class Rig:
         )
 
     def joined(self, others: Sequence["Rig"]) -> "Rig":
-        """Join the cameras of this rig and of other rigs with the same points."""
+        """Return a rig with the cameras of this rig and of other rigs.
+
+        All rigs must contain equal points.
+        """
         rigs = (self, *others)
         return replace(
             self,
@@ -113,18 +120,18 @@ class Rig:
 
     @property
     def centers(self) -> Floats:
-        """[V, 3] camera centres, input units."""
+        """Camera centres [V, 3] in input units."""
         return np.asarray(-np.einsum("vji,vj->vi", self.rotations, self.translations))
 
     def project(self, rows: Integers) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-        """Project points into the cameras.
+        """Project points into all cameras.
 
         Args:
-            rows: [V, N] rows of points for each camera.
+            rows: [V, N] rows of the points that are projected into each camera.
 
         Returns:
             [2, V, N] positions in the photo as shares of its width and height, [V, N] depths, and a
-            mask [V, N] of the points in front of the camera and in its frame.
+            mask [V, N]. The mask is True for points in front of the camera and inside the photo.
         """
         local = self.rotations @ self.points.take(rows, axis=0).transpose(0, 2, 1)
         x, y, depth = local.transpose(1, 0, 2) + self.translations.T[:, :, None]
@@ -142,14 +149,14 @@ class Rig:
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """The agreement of each photo with the points.
+    """How well each photo agrees with the points.
 
     Attributes:
-        share: [V] share of the points that are in front of the camera, in frame and not hidden;
-            NaN without any points.
-        inside: [V] number of points whose colours were compared.
-        correlation: [V] correlation of the colours of points and photo; NaN if it is undefined.
-        spread: [V] standard deviation of the points' colours, levels of 255.
+        share: [V] share of the points that are in front of the camera, inside the photo and not
+            hidden. NaN without points.
+        inside: [V] number of points whose colours were compared with the photo.
+        correlation: [V] correlation between the colours of points and photo; NaN if undefined.
+        spread: [V] standard deviation of the points' colours, in levels of 255.
     """
 
     share: Floats
@@ -159,20 +166,22 @@ class Agreement:
 
     @property
     def noise(self) -> Floats:
-        """[V] standard deviation of the points' colours around the prediction by the photo."""
+        """[V] standard deviation of the points' colours from the colours predicted by the photo."""
         return self.spread * np.sqrt(np.maximum(1.0 - np.maximum(self.correlation, 0.0) ** 2, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """The points and photos of the check.
+    """The cameras, points and photos that the check compares.
 
     Attributes:
-        pixels: Decodes the photo of a view.
-        rig: The cameras of the check.
-        rows: [V, N] rows of points for each camera, padded with -1.
-        colors: [P, 3] colours of points; None uses each point's colours in the other photos.
-        tracked: True if rows are observations; else points may be hidden or out of frame.
+        pixels: Function that decodes the photo of a view.
+        rig: The cameras and points.
+        rows: [V, N] rows of the points that are compared in each camera, padded with -1.
+        colors: [P, 3] colours of the points. If `colors` is None, each point has the mean colour
+            that other photos show.
+        tracked: True if `rows` contains observations. If `tracked` is False, points may be hidden
+            or outside the photo.
     """
 
     pixels: Pixels
@@ -182,16 +191,19 @@ class Evidence:
     tracked: bool
 
     def chosen(self, cameras: Integers) -> "Evidence":
-        """Return the evidence of some cameras."""
+        """Return the evidence for some of the cameras."""
         rows = self.rows[cameras, :MOST_TRIED]
         return replace(self, rig=self.rig.chosen(cameras), rows=rows)
 
     def of_photos(self) -> "Evidence":
-        """Return the evidence with the colours of points taken from the other photos."""
+        """Return the evidence with colours of the points from other photos."""
         return replace(self, colors=None)
 
     def sees_nothing(self, cameras: Integers) -> Booleans:
-        """Return a mask of the cameras without any point of the scene in frame."""
+        """Return a mask of `cameras`.
+
+        The mask is True if none of the scene's points is inside the photo.
+        """
         rows = np.broadcast_to(np.arange(len(self.rig.points)), (1, len(self.rig.points)))
         return np.array(
             [not self.rig.chosen([camera]).project(rows)[2].any() for camera in cameras], dtype=bool
@@ -199,13 +211,13 @@ class Evidence:
 
     @property
     def colored(self) -> bool:
-        """True if the colours of the points differ enough to be compared."""
+        """True if the colours of the points differ enough for a comparison."""
         if self.colors is None:
             return True
         return bool(self.colors[np.unique(self.rows[self.rows >= 0])].std(axis=0).max() >= FLAT)
 
     def agreement(self, rig: Rig) -> Agreement:
-        """Measure the agreement of photos and points in a rig, which a trial may have changed."""
+        """Measure how well photos and points agree in a rig. A trial may have changed the rig."""
         shares, depth, inside = rig.project(self.rows)
         is_listed = self.rows >= 0
         inside &= is_listed
@@ -228,7 +240,10 @@ class Evidence:
         return replace(agreement, correlation=np.where(few, np.nan, agreement.correlation))
 
     def _shown(self, photos: Integers, shares: Floats, inside: Booleans) -> Floats:
-        """Return the photos' colours [V, N, 3] at points; clears `inside` for masked pixels."""
+        """Return the photos' colours [V, N, 3] at the points.
+
+        `inside` becomes False for masked pixels.
+        """
         photo_of = np.repeat(photos, inside.sum(axis=1))
         order = np.argsort(photo_of, kind="stable")
         at = np.flatnonzero(inside)[order]
@@ -248,7 +263,7 @@ class Evidence:
 
 
 def pixels_of(scene: Scene) -> Pixels:
-    """Return a function that decodes the photos of a scene, and caches them."""
+    """Return a function that decodes and caches the photos of a scene."""
 
     @cache
     def decoded(view: int) -> Photo:
@@ -260,12 +275,14 @@ def pixels_of(scene: Scene) -> Pixels:
 
 
 def observed(scene: Scene, views: Integers, pixels: Pixels) -> Evidence:
-    """Collect points that some views observed, preferably points that several views observed.
+    """Collect observed points for some views.
+
+    Points that several of the views observe are preferred.
 
     Args:
         scene: The scene.
-        views: Rows of the views.
-        pixels: Decodes the photos of the views.
+        views: Indices of the views in the scene.
+        pixels: Function that decodes the photo of a view.
     """
     rank = np.random.default_rng(0).permutation(len(scene.points))
     rows = np.full((len(views), MOST_OBSERVED), -1)
@@ -279,13 +296,13 @@ def observed(scene: Scene, views: Integers, pixels: Pixels) -> Evidence:
 
 
 def tested(scene: Scene, views: Integers, pixels: Pixels, most: int) -> Evidence:
-    """Collect random points for views without tracks; a depth test later removes hidden points.
+    """Collect random points for views without tracks. A later depth test removes hidden points.
 
     Args:
         scene: The scene.
-        views: Rows of the views.
-        pixels: Decodes the photos of the views.
-        most: Number of points of all views together.
+        views: Indices of the views in the scene.
+        pixels: Function that decodes the photo of a view.
+        most: Largest number of points, summed over all views.
     """
     number, total = max(most // len(views), _TESTED), len(scene.points)
     sample = np.random.default_rng(0).choice(total, min(number, total), replace=False)
@@ -294,7 +311,7 @@ def tested(scene: Scene, views: Integers, pixels: Pixels, most: int) -> Evidence
 
 
 def _unhidden(shares: Floats, depth: Floats, inside: Booleans) -> Booleans:
-    """Return a mask [V, N] of the points in frame nearest to the camera: a coarse depth buffer."""
+    """Return a mask [V, N] of the points that no nearer point in their image cell hides."""
     cameras = len(depth)
     cells = np.clip(np.sqrt(inside.sum(axis=1) / _IN_A_CELL), 1, _CELLS).astype(np.int64)
     across, down = (
@@ -308,7 +325,14 @@ def _unhidden(shares: Floats, depth: Floats, inside: Booleans) -> Booleans:
 
 
 def _compared(share: Floats, inside: Booleans, shown: Floats, expected: Floats) -> Agreement:
-    """Compute the agreement of cameras from the colours [V, N, 3] of the points inside."""
+    """Return the agreement of photos and points, from the colours of the points in each photo.
+
+    Args:
+        share: [V] share of the points that is inside the photo.
+        inside: [V, N] mask of the points whose colours are compared.
+        shown: [V, N, 3] colours of the photos at the points.
+        expected: [V, N, 3] colours of the points.
+    """
     number = inside.sum(axis=1)
     divisor = np.maximum(number, 1)
 

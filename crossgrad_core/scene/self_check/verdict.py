@@ -1,4 +1,4 @@
-"""The verdict on a scene: which photos disagree with the points of the scene, and why."""
+"""Decide which photos of a scene disagree with its points, and why."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -30,47 +30,51 @@ from crossgrad_core.scene.self_check.evidence import (
     tested,
 )
 
-#: If more than this share of the photos disagrees, the scene as a whole disagrees.
+#: If more than this share of the photos disagrees, the scene as a whole is contradictory.
 _MOST_BAD: Final = 0.6
-#: A photo disagrees if its correlation is below this share of the correlation of the better photos.
+#: A photo disagrees if its correlation is below this share of the typical correlation of good
+#: photos.
 _BAD: Final = 0.33
-#: A pose is wrong if less than this share of its observed points is in frame.
+#: A pose is wrong if less than this share of its observed points is inside the photo.
 _IN_FRAME: Final = 0.5
-#: A photo is tested as a suspect if its correlation is below this share of the correlation of the
-#: better photos. A change or another photo fits a pose if its score is higher by this difference.
+#: `_SUSPECT`: a photo is examined if its correlation is below this share of the typical correlation
+#: of good photos. `_FITS_BETTER`: a change, or another photo, fits a pose better if its score is
+#: higher by this number.
 _SUSPECT: Final = 0.65
 _FITS_BETTER: Final = 0.25
-#: Maximum number of photos used for comparison if most photos disagree, and maximum number of
-#: tested suspects.
+#: Maximum number of photos that are compared with other poses if most photos disagree, and maximum
+#: number of examined photos.
 _MOST_COMPARED: Final = 64
 _MOST_SUSPECTS: Final = 32
-#: A photo fits if it reaches this share of the correlation of the better photos.
+#: A photo fits if its score reaches this share of the typical correlation of good photos.
 _FITS: Final = 0.7
-#: If there are at most this many photos, only mirrored and rotated copies are tested, because
-#: another change could fit by chance.
+#: Up to this number of photos, only rotations and reflections are tested. Other changes could fit
+#: so few photos by chance.
 _FEW: Final = 2
-#: Minimum number of points in frame of a photo that has no tracks or is compared with other photos.
+#: Minimum number of points inside a photo that has no tracks or is compared with another pose.
 _FEWEST_TESTED: Final = 3 * FEWEST
-#: A photo without tracks disagrees if its correlation is this many standard errors below the limit.
+#: A photo without tracks disagrees if its correlation is below the limit by this number of standard
+#: errors.
 _ERRORS: Final = 3.0
-#: Number of points that are tested in all photos of a scene without tracks.
+#: Number of points, summed over all photos, that are tested in a scene without tracks.
 _MOST_TESTED: Final = 300_000
-#: The better photos are those above this quantile of the correlation.
+#: The typical correlation of good photos is this quantile of all correlations.
 _BETTER: Final = 0.75
-#: Photos with a lower score are also tested with the likely changes of all cameras.
+#: If the mean score of the good photos is below this number, changes of all cameras that correct
+#: common mistakes are tested.
 _SURE: Final = 0.75
-#: Minimum gain of a small change of all cameras that counts as the cause.
+#: Smallest gain in score for which a change of all cameras counts as the cause.
 _GAIN_OF_ALL: Final = 0.08
 
 
 @dataclass(frozen=True)
 class Cause:
-    """Why some photos disagree.
+    """The reason why some photos disagree with the points.
 
     Attributes:
-        views: The photos.
-        what: The cause.
-        todo: The remedy for the user.
+        views: Indices of the photos that disagree.
+        what: Description of the cause.
+        todo: The remedy that is suggested to the user.
     """
 
     views: tuple[int, ...]
@@ -80,15 +84,16 @@ class Cause:
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """The result of the check for a scene.
+    """The result of checking a scene.
 
     Attributes:
-        compared: Number of photos that were compared with points.
-        correlation: Median correlation of colours; NaN if nothing could be compared.
-        in_frame: Median share of the observed points in frame; NaN without tracks.
-        all_wrong: Why the whole scene disagrees; None if it agrees.
-        some_wrong: Why some photos disagree.
-        notes: Other findings.
+        compared: Number of photos that were compared with the points.
+        correlation: Median colour correlation of all photos; NaN if no colours could be compared.
+        in_frame: Median share of the observed points that are inside their photos; NaN without
+            tracks.
+        all_wrong: Why the scene as a whole is contradictory; None for a consistent scene.
+        some_wrong: Why single photos disagree.
+        notes: Other results for the user.
     """
 
     compared: int
@@ -115,12 +120,12 @@ _UNKNOWN: Final = Verdict(0, np.nan, np.nan)
 
 
 def verdict_of(scene: Scene, views: Sequence[int], pixels: Pixels) -> Verdict:
-    """Check some views of a scene.
+    """Check some views of a scene, and return the verdict.
 
     Args:
         scene: The scene.
-        views: Rows of the views.
-        pixels: Decodes the photos of the views.
+        views: Indices of the views in the scene.
+        pixels: Function that decodes the photo of a view.
 
     Raises:
         UserError: A photo cannot be decoded.
@@ -135,8 +140,8 @@ def verdict_of(scene: Scene, views: Sequence[int], pixels: Pixels) -> Verdict:
         )
     has_tracks = np.array([len(scene.views[view].seen) >= FEWEST for view in views])
     rows = np.asarray(views, dtype=np.int64)
-    # If some photos have tracks, skip the photos without tracks, because hidden points would give
-    # wrong results.
+    # If some photos have tracks, leave out the photos without tracks. Hidden points in photos
+    # without tracks would give wrong results.
     if has_tracks.any():
         rows = rows[has_tracks]
         return _Group.of(observed(scene, rows, pixels), rows).verdict()
@@ -145,14 +150,14 @@ def verdict_of(scene: Scene, views: Sequence[int], pixels: Pixels) -> Verdict:
 
 @dataclass(frozen=True, eq=False)
 class _Group:
-    """A group of photos, either all with tracks or all without.
+    """A group of photos. Either all photos of a group have tracks, or no photo has tracks.
 
     Attributes:
-        evidence: The points for the comparison.
-        views: [V] rows of the views.
-        agreement: Agreement of the unchanged photos.
-        recolored: True if the points' own colours are useless; the photos' colours then replace
-            them.
+        evidence: The cameras, points and photos to compare.
+        views: [V] indices of the views in the scene.
+        agreement: How well the photos agree with the points without any change.
+        recolored: True if the colours of the points contain no information. If `recolored` is True,
+            colours from other photos replace the colours of the points.
     """
 
     evidence: Evidence
@@ -166,24 +171,27 @@ class _Group:
         return group.by_photos() if evidence.tracked and not evidence.colored else group
 
     def by_photos(self) -> "_Group":
-        """Return the same photos, with the colours of points taken from the other photos."""
+        """Return this group of photos, but with colours of the points from other photos."""
         evidence = self.evidence.of_photos()
         return _Group(evidence, self.views, evidence.agreement(evidence.rig), recolored=True)
 
     @cached_property
     def better(self) -> float:
-        """The correlation of the better photos; 0 if no photo has a correlation."""
+        """The typical correlation of good photos; 0 if no photo has a correlation."""
         correlations = self.agreement.correlation[np.isfinite(self.agreement.correlation)]
         return float(np.quantile(correlations, _BETTER)) if len(correlations) else 0.0
 
     @property
     def told(self) -> Booleans:
-        """[V] photos with enough information for a verdict."""
+        """[V] True for photos with enough information for a verdict."""
         return np.isfinite(self.agreement.correlation) | self._out
 
     @cached_property
     def _out(self) -> Booleans:
-        """[V] photos with most of their observed points, or all points, out of frame."""
+        """[V] True for photos with more than half of their observed points outside the image.
+
+        Without tracks, True if all points of the scene are outside the image.
+        """
         if self.evidence.tracked:
             return np.asarray(self.agreement.share < _IN_FRAME)
         out = self.agreement.share == 0.0
@@ -192,16 +200,19 @@ class _Group:
 
     @cached_property
     def bad(self) -> Booleans:
-        """[V] photos that disagree: low correlation, and colours that deviate too much."""
+        """[V] True for photos that disagree.
+
+        A photo disagrees if its correlation is low and its colours deviate too much.
+        """
         correlation, noise = self.agreement.correlation, self.agreement.noise
         low = np.nan_to_num(correlation, nan=1.0) < _BAD * self.better
         good = np.isfinite(correlation) & ~low
         typical_noise = float(np.median(noise[good])) if good.any() else 0.0
-        # The limit is halfway between the noise of consistent photos and of unrelated photos.
+        # The limit is the geometric mean of the noise of good photos and of unrelated photos.
         unlike = low & (
             np.nan_to_num(noise) > typical_noise * (1.0 - min(self.better, 0.99) ** 2) ** -0.25
         )
-        # Colours that come from only a few other photos are not reliable enough.
+        # Colours that come from only a few other photos are not reliable enough for this test.
         if self.recolored:
             unlike[:] = False
         if not self.evidence.tracked:
@@ -211,7 +222,7 @@ class _Group:
         return np.asarray(unlike | out)
 
     def verdict(self) -> Verdict:
-        """Return the result for these photos."""
+        """Return the verdict on the photos of this group."""
         correlation = self.agreement.correlation
         has_correlation = np.isfinite(correlation)
         verdict = Verdict(
@@ -240,7 +251,10 @@ class _Group:
         return replace(verdict, some_wrong=self.suspects())
 
     def _of_all(self, rows: Integers) -> Cause | None:
-        """Find a change of all cameras that improves photos which agree only partly."""
+        """Find a change of all cameras that improves photos which agree only in part.
+
+        If no change improves the photos, return None.
+        """
         bench = Bench(self.evidence, rows)
         if bench.before < _SURE:
             diagnosis = bench.best(likely())
@@ -254,14 +268,14 @@ class _Group:
 
     @property
     def _mean(self) -> float:
-        """The mean score of the photos with enough information."""
+        """Mean score of the photos with enough information."""
         return float(scores(self.agreement, tracked=self.evidence.tracked)[self.told].mean())
 
     def _cause(self, trial: Trial) -> Cause:
         return Cause(tuple(self.views.tolist()), trial.cause, trial.todo)
 
     def _as_a_whole(self, verdict: Verdict) -> Verdict:
-        """Return the result if most photos disagree."""
+        """Return the verdict if most photos disagree."""
         cameras = np.arange(len(self.views))
         bench = Bench(self.evidence, cameras)
         diagnosis = bench.best(likely()) if self.recolored else bench.diagnosis()
@@ -274,7 +288,7 @@ class _Group:
         return self._unexplained(verdict)
 
     def _unexplained(self, verdict: Verdict) -> Verdict:
-        """Return the result if most photos disagree and no trial repairs them."""
+        """Return the verdict if most photos disagree and no trial makes them agree."""
         if self.better >= LEAST:
             return replace(verdict, some_wrong=self.suspects())
         unrelated = Cause(tuple(self.views.tolist()), *_UNRELATED)
@@ -289,7 +303,7 @@ class _Group:
         return replace(verdict, notes=(*verdict.notes, note))
 
     def suspects(self) -> tuple[Cause, ...]:
-        """Return why single photos disagree."""
+        """Return the reasons why single photos disagree."""
         bad, correlation = self.bad, self.agreement.correlation
         if self.recolored:
             rows = np.flatnonzero(bad)
@@ -301,7 +315,8 @@ class _Group:
         if not len(rows):
             return ()
         causes = []
-        # If a photo belongs to another pose, its own pose has the wrong photo.
+        # First test whether photos were exchanged. If a photo belongs to another pose, its own pose
+        # has the wrong photo.
         exchanged = self._fitting_others(rows, rows)
         if len(exchanged):
             causes.append(Cause(self._named(exchanged), *_EXCHANGED))
@@ -318,7 +333,7 @@ class _Group:
         return tuple(self.views[rows].tolist())
 
     def _in_common(self, rows: Integers) -> tuple[Cause | None, Integers]:
-        """Find a change that repairs most photos, or a turn that repairs some.
+        """Find a change that repairs most photos, or a rotation or reflection that repairs some.
 
         Return the cause, and the rows of the repaired photos.
         """
@@ -340,7 +355,7 @@ class _Group:
         return Cause(self._named(repaired), diagnosis.trial.cause, diagnosis.trial.todo), repaired
 
     def _repaired(self, diagnosis: Diagnosis, rows: Integers) -> Integers:
-        """Return the photos that a change repairs."""
+        """Return the rows of the photos that a trial repairs."""
         if diagnosis.trial is None:
             return rows[:0]
         evidence = self.evidence.chosen(rows)
@@ -348,24 +363,28 @@ class _Group:
         return rows[self._fits(scores(changed, tracked=evidence.tracked), rows)]
 
     def _fits(self, after: Floats, rows: Integers) -> Booleans:
-        """Return a mask of the photos that fit only after a change, by their scores."""
+        """Return a mask of the photos that fit only after a change.
+
+        `after` contains the scores of all photos after the change.
+        """
         before = scores(self.agreement, tracked=self.evidence.tracked)[rows]
         return np.asarray((after > before + _FITS_BETTER) & (after > self._fitting))
 
     @property
     def _fitting(self) -> float:
-        """The lowest score at which a photo counts as fitting."""
+        """The lowest score with which a photo fits."""
         return max(_FITS * self.better, LEAST)
 
     def _fitting_others(self, rows: Integers, candidates: Integers) -> Integers:
-        """Return the cameras that fit the photo of another camera among the candidates."""
+        """Return the rows of cameras that fit the photo of another camera in `candidates`."""
         others = self.views[candidates]
         fitting = []
         for row in rows:
             evidence = self.evidence.chosen(np.full(len(others), row))
             agreement = evidence.agreement(replace(evidence.rig, photos=others))
             fit = scores(agreement, tracked=self.evidence.tracked)
-            # With many candidate photos, a photo may fit by chance if it contains few points.
+            # Leave out photos with few projected points. Such a photo could fit by chance, because
+            # the camera is compared with many photos.
             fit[(others == self.views[row]) | (agreement.inside < _FEWEST_TESTED)] = 0.0
             if self._fits(fit.max(keepdims=True), np.array([row]))[0]:
                 fitting.append(row)

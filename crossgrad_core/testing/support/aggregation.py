@@ -1,4 +1,4 @@
-"""Contract checks of operators in the training step, which combine K gradients into one."""
+"""Contract checks for operators in a training step, where they combine K gradients."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -39,7 +39,10 @@ Gradients = dict[str, Tensor | None]
 
 
 def sample_gradients(views: int, seed: int = 0) -> list[Gradients]:
-    """Make gradients of `views` views: ordinary, conflicting, and without one block."""
+    """Create random gradients of `views` views.
+
+    With two or more views, the last view has no gradient of one block.
+    """
     rng = np.random.default_rng([views, seed])
 
     def gradient(shape: tuple[int, ...]) -> Tensor:
@@ -48,7 +51,7 @@ def sample_gradients(views: int, seed: int = 0) -> list[Gradients]:
     gradients: list[Gradients] = [
         {name: gradient(shape) for name, shape in _SHAPES.items()} for _ in range(views)
     ]
-    # The last view gives no gradient to the network, except if it is the only view.
+    # With more than one view, the last view has no gradient of the network.
     if views > 1:
         gradients[-1] |= {"net.weight": None, "net.bias": None}
     return gradients
@@ -57,11 +60,12 @@ def sample_gradients(views: int, seed: int = 0) -> list[Gradients]:
 def aggregate_context(
     gradients: Sequence[Mapping[str, Tensor | None]], *, summed: bool = False
 ) -> AggregateContext:
-    """Make the context of the aggregation hook for these gradients.
+    """Create the context of the aggregation hook for some gradients.
 
     Args:
         gradients: The gradients of each view.
-        summed: True to offer only their sum, as in a run without consumers of separate gradients.
+        summed: True to provide only the sum of the gradients, as in a run in which no plugin reads
+            separate gradients.
     """
     views = len(gradients)
     rng = np.random.default_rng(views)
@@ -79,7 +83,7 @@ def aggregate_context(
 def _summed(gradients: Sequence[Mapping[str, Tensor | None]]) -> SummedGradients:
     total = SummedGradients.empty(BLOCKS, len(gradients))
     for view in gradients:
-        # The sum takes ownership of the tensors and modifies them.
+        # The sum owns and modifies the tensors that are added.
         total.add(
             {
                 name: None if gradient is None else gradient.clone()
@@ -92,7 +96,7 @@ def _summed(gradients: Sequence[Mapping[str, Tensor | None]]) -> SummedGradients
 def aggregated(
     operator: Operator, gradients: Sequence[Mapping[str, Tensor | None]], *, summed: bool = False
 ) -> AggregateResult:
-    """Return the operator's answer at the hook; see `aggregate_context`."""
+    """Return the operator's result of the aggregation hook (see `aggregate_context`)."""
     return _answer(operator, aggregate_context(gradients, summed=summed))
 
 
@@ -105,9 +109,9 @@ def _answer(operator: Operator, context: AggregateContext) -> AggregateResult:
 
 
 def every_tensor_is_answered(make: Make[Operator]) -> None:
-    """The answer contains a finite gradient of the right shape for every tensor.
+    """The result contains a finite gradient of the right shape for every tensor.
 
-    An operator without `separate = True` computes the same gradients from the sum alone.
+    An operator without `separate = True` returns equal gradients if only the sum is available.
     """
     operator = make()
     for views in admitted(operator.views):
@@ -134,7 +138,10 @@ def _require_gradient(what: str, gradient: Tensor | None, shape: tuple[int, ...]
 
 
 def absent_views_have_no_weight(make: Make[Operator]) -> None:
-    """A view without a valid gradient (not visible, all zero or not finite) has no influence."""
+    """A view without a valid gradient has no influence.
+
+    A gradient is invalid if the gradient is missing, zero or not finite.
+    """
     operator = make()
     for views in admitted(operator.views):
         answers = []
@@ -158,7 +165,10 @@ def _require_same(what: str, one: Tensor | None, other: Tensor | None) -> None:
 
 
 def gradients_stay_untouched(make: Make[Operator]) -> None:
-    """The views' gradients do not change, because diagnostics read them afterwards."""
+    """The operator does not change the gradients of the views.
+
+    Other plugins read the gradients of the views later.
+    """
     operator = make()
     for views in admitted(operator.views):
         gradients, copies = sample_gradients(views), sample_gradients(views)
@@ -171,7 +181,10 @@ def gradients_stay_untouched(make: Make[Operator]) -> None:
 
 
 def same_seed_same_aggregation(make: Make[Operator]) -> None:
-    """Two calls with one seed give the same bits, and their states survive a checkpoint."""
+    """Two calls with equal seeds return equal bits.
+
+    The returned states survive a checkpoint.
+    """
     for views in admitted(make().views):
         with global_randomness_untouched():
             one = aggregated(make(), sample_gradients(views))
@@ -187,9 +200,10 @@ def same_seed_same_aggregation(make: Make[Operator]) -> None:
 
 
 def equal_gradients_have_a_scale(make: Make[Operator]) -> None:
-    """K equal gradients in a neutral context get finite weights, equal in every call.
+    """K equal gradients in a neutral context get finite weights, which are equal in every call.
 
-    The scale of regularisers and of the optimizer depends on the sum of these weights.
+    The sum of these weights determines the scale of regularization terms and of the optimizer's
+    input.
     """
     for views in admitted(make().views):
         context = aggregate_context(sample_gradients(views))
@@ -208,7 +222,7 @@ def states_stay_bounded(make: Make[Operator]) -> None:
 
 
 def _states(operator: Operator, context: AggregateContext) -> Iterator[PluginState]:
-    """Yield the operator's state after each step of an endless run."""
+    """Yield the operator's state after each step of a run without an end."""
     states: Mapping[str, PluginState] = {}
     for step in count(1):
         states = _answer(operator, replace(context, step=step, states=states)).states

@@ -1,4 +1,4 @@
-"""Checks that components of every slot must pass."""
+"""Contract checks for the components of every slot."""
 
 from pydantic import ValidationError
 
@@ -10,7 +10,7 @@ from crossgrad_core.wording import in_one_line, listed, sentences
 
 
 def options_are_frozen(make: Make[Component]) -> None:
-    """Options cannot be changed after construction, and the component can be hashed."""
+    """Options cannot change after construction, and the component is hashable."""
     component = make()
     require(component.model_config.get("frozen"), "the model is not frozen: keep `frozen=True`")
     try:
@@ -22,7 +22,7 @@ def options_are_frozen(make: Make[Component]) -> None:
 
 
 def unknown_options_are_refused(make: Make[Component]) -> None:
-    """A misspelt option raises an error."""
+    """An option with a misspelt name raises an error."""
     component = make()
     surprise = {**component.model_dump(), "no_such_option_": 1}
     try:
@@ -33,7 +33,7 @@ def unknown_options_are_refused(make: Make[Component]) -> None:
 
 
 def options_survive_the_configuration_file(make: Make[Component]) -> None:
-    """Options that are written to config.yaml and read again are equal."""
+    """Options that are written to config.yaml and read again are equal to the original options."""
     component = make()
     try:
         again = type(component).model_validate(component.model_dump(mode="json"))
@@ -45,7 +45,7 @@ def options_survive_the_configuration_file(make: Make[Component]) -> None:
 
 
 def options_are_described(make: Make[Component]) -> None:
-    """`crossgrad plugins show` can describe each option."""
+    """Each option has a description, which `crossgrad plugins show` prints."""
     fields = type(make()).model_fields
     silent = [name for name, field in fields.items() if not field.description]
     require(
@@ -54,7 +54,7 @@ def options_are_described(make: Make[Component]) -> None:
 
 
 def options_can_be_set(make: Make[Component]) -> None:
-    """No option is called `name`, because this key chooses the component."""
+    """No option has the name `name`, because this key chooses the component."""
     clear = "name" not in type(make()).model_fields
     require(
         clear, "the option `name` cannot be set, because this key chooses the component: rename it"
@@ -62,7 +62,7 @@ def options_can_be_set(make: Make[Component]) -> None:
 
 
 def hooks_exist(make: Make[Component]) -> None:
-    """Every hook that the component implements exists, is marked and takes the hook's arguments."""
+    """Each hook of the component exists, is marked with `hookimpl`, and has valid arguments."""
     try:
         make_manager({"component": make()})
     except UserError as error:

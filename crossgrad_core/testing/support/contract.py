@@ -1,8 +1,8 @@
-"""Building blocks for contract checks.
+"""Building blocks of contract checks.
 
-A check is a plain function `check(make)`. `make()` returns a fresh component with default options.
-The check raises `ContractError` with a sentence for the author of the component. Checks need
-neither pytest nor hypothesis. With pytest, a few lines run all checks:
+A check is a function `check(make)`. `make()` returns a new component with default options. If the
+component breaks the contract, the check raises `ContractError` with a sentence for its author.
+Checks do not need pytest or hypothesis. With pytest, these lines run all checks:
 
     @pytest.mark.parametrize("check", OPERATOR_CHECKS)
     def test_contract(check):
@@ -26,36 +26,43 @@ from crossgrad_core.training.state import unsavable
 
 C = TypeVar("C", bound=Component)
 
-#: Function that returns a fresh component with default options.
+#: Function that returns a new component with default options.
 Make = Callable[[], C]
-#: Function that raises `ContractError` if a component breaks the contract, or `SkipTest` if this
-#: cannot be decided.
+#: Function that raises `ContractError` if a component breaks the contract, or `SkipTest` if the
+#: check does not apply.
 Check = Callable[[Make[C]], None]
 
-#: Numbers of views per step that the checks try if the component supports them.
+#: Numbers of views per step that the checks try. Numbers of views that the component does not
+#: support are skipped.
 VIEW_COUNTS = range(1, 7)
 
 
 class ContractError(AssertionError):
-    """A broken contract of a component; the text describes the violation."""
+    """A component has broken its contract. The text of the error describes how."""
 
 
 def require(holds: object, otherwise: str) -> None:
-    """Raise `ContractError(otherwise)` unless a condition holds (also under `python -O`)."""
+    """Raise `ContractError(otherwise)` if `holds` is not true.
+
+    In contrast to `assert`, this function also works with `python -O`.
+    """
     if not holds:
         raise ContractError(otherwise)
 
 
 def cannot_tell(reason: str) -> SkipTest:
-    """Return the exception for a check that does not apply; pytest reports it as skipped."""
+    """Return the exception for a check that does not apply.
+
+    With this exception, pytest reports a skipped check.
+    """
     return SkipTest(reason)
 
 
 def admitted(views: ViewCounts) -> tuple[int, ...]:
-    """Return the numbers of views per step that checks try.
+    """Return the numbers of views per step that the checks try.
 
     Raises:
-        ContractError: No number from `VIEW_COUNTS` is admitted.
+        ContractError: The component supports no number in `VIEW_COUNTS`.
     """
     counts = tuple(count for count in VIEW_COUNTS if views.admits(count))
     require(
@@ -65,10 +72,12 @@ def admitted(views: ViewCounts) -> tuple[int, ...]:
 
 
 def revived(state: PluginState) -> PluginState:
-    """Return the state as loaded from a checkpoint: values through JSON, tensors copied.
+    """Return the state after a simulated checkpoint.
+
+    Values are converted to JSON and back, and tensors are copied.
 
     Raises:
-        ContractError: The values do not survive JSON.
+        ContractError: The values cannot be stored as JSON.
     """
     try:
         values = json.loads(json.dumps(dict(state.values), allow_nan=False))
@@ -84,7 +93,7 @@ def revived(state: PluginState) -> PluginState:
 
 
 def same_state(one: PluginState, other: PluginState) -> bool:
-    """Return True if two states contain the same values and the same bits."""
+    """Return True if two states have equal values and bit-identical tensors."""
     return (
         dict(one.values) == dict(other.values)
         and _same_tensors(one.tensors, other.tensors)
@@ -94,7 +103,7 @@ def same_state(one: PluginState, other: PluginState) -> bool:
 
 @contextmanager
 def global_randomness_untouched() -> Iterator[None]:
-    """Raise `ContractError` if the block draws from a global random number generator."""
+    """Raise `ContractError` if code in the block uses a global random number generator."""
     before = _global_states()
     yield
     for name, state in _global_states().items():

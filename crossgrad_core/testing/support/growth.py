@@ -1,7 +1,8 @@
-"""Measurement of the costs of a plugin: its state, the time of its hooks, and its memory.
+"""Measure the costs of a plugin: the size of its state, the time of its hooks, and its memory.
 
-The size of a state may depend on the numbers of views and primitives, and on a window of the last
-steps. If a state grows with every step, each checkpoint is larger than the checkpoint before it.
+The size of a state may depend on the number of views, on the number of primitives, and on a window
+of recent steps. A state must not grow with every step, because each checkpoint would be larger than
+the previous checkpoint.
 """
 
 import gc
@@ -17,16 +18,20 @@ from torch import Tensor
 from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.testing.support.contract import require
 
-#: Number of steps before the first measurement. Within these steps, a state of fixed size reaches
-#: its full size.
+#: Number of steps that `require_bounded` checks first. The check passes if the state does not grow
+#: in the second half of these steps.
 _FEW = 16
-#: Number of steps in each of the three later windows. A state with a shorter history has stopped
-#: growing by then.
+#: If the state grows, `require_bounded` compares the largest sizes in three windows. Each window
+#: has this number of steps. A state that stores fewer recent steps than this number stops growing
+#: in the first window.
 _WINDOW = 1000
 
 
 def size_of(state: PluginState) -> int:
-    """Count the numbers, letters and names in a state; per-primitive tensors count one row."""
+    """Return the number of numbers, letters and names in a state.
+
+    Of a per-primitive tensor, only one row is counted.
+    """
     rows = sum(tensor[:1].numel() for tensor in state.per_primitive.values())
     return _size(state.values) + sum(tensor.numel() for tensor in state.tensors.values()) + rows
 
@@ -42,10 +47,11 @@ def _size(value: object) -> int:
 
 
 def require_bounded(sizes: Iterable[int], method: str) -> None:
-    """Require that the state of a run stops growing.
+    """Require that the state of a run stops growing after some steps.
 
     Args:
-        sizes: Size of the state after each step of a long run, computed lazily.
+        sizes: Size of the state after each step of a long run. The iterable computes a size only on
+            demand.
         method: Name of the method that returns the state.
     """
     steps = iter(sizes)
@@ -67,7 +73,7 @@ def _largest(sizes: Iterator[int], steps: int) -> int:
 
 
 def time_hooks(manager: pluggy.PluginManager, seconds: dict[str, float]) -> None:
-    """Write the wall time of the fastest call of each hook into `seconds` during calls."""
+    """From now on, record the wall time of the fastest call of each hook in `seconds`."""
     begun: list[float] = []
 
     def before(*_: object) -> None:
@@ -82,7 +88,7 @@ def time_hooks(manager: pluggy.PluginManager, seconds: dict[str, float]) -> None
 
 @contextmanager
 def traced_memory() -> Iterator[Callable[[], int]]:
-    """Yield a function that returns the bytes allocated by Python, NumPy and tensors."""
+    """Yield a function that returns the bytes allocated by Python, NumPy and torch tensors."""
     traced = tracemalloc.is_tracing()
     if not traced:
         tracemalloc.start()
@@ -94,11 +100,11 @@ def traced_memory() -> Iterator[Callable[[], int]]:
 
 
 def _tensors() -> int:
-    """Return the bytes of all live tensors; tracemalloc does not see torch's allocations."""
+    """Return the bytes of all existing tensors. tracemalloc does not record torch's allocations."""
     gc.collect()
     storages = {}
     for candidate in gc.get_objects():
-        # Do not use `isinstance`, because it makes some objects emit warnings.
+        # Do not use `isinstance`, because `isinstance` makes some objects emit warnings.
         if issubclass(type(candidate), Tensor) and not candidate.is_sparse:
             storage = candidate.untyped_storage()
             storages[storage.data_ptr()] = storage.nbytes()

@@ -1,8 +1,9 @@
-"""Contract checks of rasterizers against rasterizer `torch` in float64, the readable rule set.
+"""Contract checks that compare rasterizers with rasterizer `torch` in float64, the reference.
 
-Inputs are ordinary Gaussians, off-centre cameras, and Gaussians at the extremes of training. A
-pixel may differ for two reasons. Rounding decides whether a few Gaussians are drawn at the edge of
-their footprint. In addition, float32 has a rounding error, which is measured on the reference.
+The inputs are ordinary Gaussians, cameras with unusual intrinsics, and extreme Gaussians that occur
+in training. A pixel may differ from the reference for two reasons. First, rounding can add or
+remove a few Gaussians at the edge of their footprints. Second, float32 has rounding errors. The
+size of rounding errors is measured by running the reference itself in float32.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -21,16 +22,17 @@ from crossgrad_core.registry.entries import build
 from crossgrad_core.testing.fixtures import sample_camera, sample_gaussians, sample_scene
 from crossgrad_core.testing.support.contract import Check, ContractError, Make, cannot_tell, require
 
-#: Largest difference of a pixel from the reference. It occurs if a few Gaussians differ at the edge
-#: of their footprint.
+#: Largest allowed difference between a pixel and the reference. A difference of this size occurs if
+#: rounding adds or removes a few Gaussians at the edge of their footprints.
 _PIXEL = 0.02
-#: Largest mean difference of pixels, and relative difference of gradients, from the reference.
+#: Largest allowed mean difference of pixels, and largest allowed relative difference of gradients.
 _MEAN, _GRADIENT = 2e-4, 2e-2
-#: Maximum ratio of a rasterizer's rounding error to the reference's rounding error in float32.
+#: A rasterizer's rounding error may be this many times the rounding error of the reference in
+#: float32.
 _ROUNDINGS = 8.0
-#: Colour of the background, with three different channels.
+#: Colour of the background; each channel has a different value.
 _BACKGROUND = (0.1, 0.5, 0.9)
-#: How the pixels of each output are computed.
+#: How each output is computed, as part of error messages.
 _RULES = {
     "image": "blend front to back over the background, by the common rules",
     "alpha": "alpha is 1 minus the transmittance",
@@ -39,7 +41,7 @@ _RULES = {
 
 
 def device_of(rasterizer: Rasterizer) -> torch.device:
-    """Return the device of the checks.
+    """Return the device on which the checks run.
 
     Raises:
         SkipTest: The rasterizer needs a device that is not available.
@@ -52,7 +54,7 @@ def device_of(rasterizer: Rasterizer) -> torch.device:
 
 
 def tensors_of(gaussians: Gaussians) -> dict[str, Tensor]:
-    """Return the tensors that are not None, by name."""
+    """Return the tensors of Gaussians by name, except tensors that are None."""
     values = {member.name: getattr(gaussians, member.name) for member in fields(gaussians)}
     return {name: value for name, value in values.items() if isinstance(value, Tensor)}
 
@@ -60,7 +62,7 @@ def tensors_of(gaussians: Gaussians) -> dict[str, Tensor]:
 def moved(
     gaussians: Gaussians, device: torch.device, dtype: torch.dtype = torch.float32
 ) -> Gaussians:
-    """Copy Gaussians to a device, as leaves with gradients."""
+    """Copy Gaussians to a device, as leaf tensors that require gradients."""
     leaves: dict[str, Any] = {
         name: tensor.detach().clone().to(device, dtype).requires_grad_()
         for name, tensor in tensors_of(gaussians).items()
@@ -70,13 +72,13 @@ def moved(
 
 @dataclass(frozen=True)
 class _Case:
-    """Gaussians, a camera and options for one render.
+    """The input of one render: Gaussians, a camera and options.
 
     Attributes:
-        name: The special property of the case.
-        gaussians: The Gaussians, float32.
+        name: Description of what is special about the input.
+        gaussians: The Gaussians, in float32.
         camera: The camera.
-        options: Options of the rasterizer.
+        options: Options of the rasterizer, by name.
     """
 
     name: str
@@ -131,8 +133,8 @@ def _options() -> Iterator[_Case]:
     yield _Case("option max_alpha = 0.5", opaque, options={"max_alpha": 0.5})
     yield _Case("option dilation = 2", gaussians, options={"dilation": 2.0})
     depths = _depths(gaussians, camera).sort().values
-    # Choose the value inside the widest gap between depths, so that rounding cannot move a Gaussian
-    # to the other side.
+    # Choose the depth in the middle of the widest gap between Gaussians. At this depth, rounding
+    # cannot move a Gaussian across the near plane.
     inner = slice(len(depths) // 4, 3 * len(depths) // 4)
     gaps = depths.diff()[inner]
     widest = int(gaps.argmax()) + len(depths) // 4
@@ -147,11 +149,12 @@ def _depths(gaussians: Gaussians, camera: Camera) -> Tensor:
 
 @dataclass(frozen=True)
 class _Drawn:
-    """The outputs and gradients of one render, float64 on the CPU.
+    """The outputs and gradients of one render, as float64 tensors on the CPU.
 
     Attributes:
-        pixels: Image, alpha and, if provided, depth.
-        gradients: Gradients of the Gaussians' tensors and of the screen statistics.
+        pixels: Image, alpha and, for rasterizers that provide it, depth.
+        gradients: Gradients of the tensors of the Gaussians, and gradients in the screen
+            statistics.
     """
 
     pixels: Mapping[str, Tensor]
@@ -178,12 +181,12 @@ def _drawn(
 
 
 def _given(tensors: Mapping[str, Tensor | None]) -> dict[str, Tensor]:
-    """Return the tensors that are not None, float64 on the CPU."""
+    """Return the tensors as float64 on the CPU, except tensors that are None."""
     return {n: t.detach().cpu().double() for n, t in tensors.items() if t is not None}
 
 
 def _weighted(render: Render) -> Tensor:
-    """Return a weighted sum of all channels in which every pixel has a different weight."""
+    """Return a weighted sum of all outputs. Every pixel and channel has a different weight."""
     channels = [render.image, render.alpha[..., None]]
     if render.depth is not None:
         channels.append(render.depth[..., None])
@@ -193,7 +196,7 @@ def _weighted(render: Render) -> Tensor:
 
 
 def _require_same(rasterizer: Rasterizer, case: _Case) -> None:
-    """Require the reference's image, alpha, depth, gradients and statistics."""
+    """Require that image, alpha, depth, gradients and statistics match the reference."""
     shared = {name: getattr(rasterizer, name) for name in Rasterizer.model_fields}
     reference = build(Rasterizer, REFERENCE_RASTERIZER, shared)
     outputs = rasterizer.provides & {"depth", "abs_gradient"}
@@ -211,7 +214,8 @@ def _require_pixels(
 ) -> None:
     require(name in drawn, f"{case}: render gives no {name}")
     error, lost = (drawn[name] - expected).abs(), (rounded - expected).abs()
-    # At the edge of a Gaussian, the depth error is proportional to the distance of the Gaussian.
+    # If a Gaussian at its edge is missing, the depth error is proportional to the Gaussian's
+    # distance.
     size = max(1.0, float(expected.abs().max()))
     most = _PIXEL * size + _ROUNDINGS * float(lost.max())
     mean = _MEAN * size + _ROUNDINGS * float(lost.mean())
@@ -241,17 +245,17 @@ def _require_gradient(
 
 
 def the_reference_draws_the_same(make: Make[Rasterizer]) -> None:
-    """Image, alpha, depth, gradients and statistics agree with rasterizer `torch` in float64."""
+    """Image, alpha, depth, gradients and statistics match rasterizer `torch` in float64."""
     _require_all(make(), _usual)
 
 
 def the_camera_is_heeded(make: Make[Rasterizer]) -> None:
-    """The render uses the pose, focal lengths, principal point and size of the given camera."""
+    """The render uses the pose, focal lengths, principal point and image size of the camera."""
     _require_all(make(), _cameras)
 
 
 def extreme_gaussians_are_drawn_alike(make: Make[Rasterizer]) -> None:
-    """Opaque, transparent, thin, huge and tiny Gaussians are rendered like the reference."""
+    """Opaque, transparent, thin, very large and very small Gaussians match the reference."""
     _require_all(make(), _extremes)
 
 
@@ -261,13 +265,16 @@ def _require_all(rasterizer: Rasterizer, cases: Callable[[], Iterator[_Case]]) -
 
 
 def its_options_are_heeded(make: Make[Rasterizer]) -> None:
-    """`max_alpha`, `near` and `dilation` have the effect that the rules define, or are fixed."""
+    """The options `max_alpha`, `near` and `dilation` work as the rules define.
+
+    A rasterizer may also support only one value of an option.
+    """
     rasterizer, tried = make(), 0
     for case in _options():
         try:
             changed = type(rasterizer).model_validate({**rasterizer.model_dump(), **case.options})
         except ValidationError:
-            continue  # The rasterizer reports that it supports only one value.
+            continue  # The rasterizer supports only one value of this option.
         tried += 1
         _require_same(changed, case)
     if not tried:
@@ -275,7 +282,10 @@ def its_options_are_heeded(make: Make[Rasterizer]) -> None:
 
 
 def views_drawn_together_are_the_same(make: Make[Rasterizer]) -> None:
-    """`render_views` gives the same images as `render` for each view, with its own background."""
+    """`render_views` returns the images that `render` returns for each single view.
+
+    Each view has its own background.
+    """
     rasterizer = make()
     device = device_of(rasterizer)
     gaussians = [moved(sample_gaussians(number), device) for number in (30, 30, 12)]

@@ -1,7 +1,7 @@
-"""Contexts of hooks without a run: parameters, Gaussians, renders on request, view records.
+"""Contexts of hooks outside a run: parameters, Gaussians, renders on request, and view records.
 
-A run updates rows of some tensors only if a hook reads the rows. Therefore, the contexts of a run
-do not contain plain dictionaries and plain Gaussians.
+In a run, some rows are updated only on demand, when a hook reads these rows. The contexts of a run
+therefore use special types instead of a plain dictionary and plain Gaussians.
 """
 
 from collections.abc import Mapping
@@ -32,7 +32,10 @@ def renders_of(
     rasterizer: Rasterizer,
     parameters: Mapping[str, Tensor],
 ) -> RenderOnRequest:
-    """Make the `render` function of a context: black background, no exposure, default loss."""
+    """Create the function `render` of a context.
+
+    The renders use a black background, no exposure and the default loss.
+    """
     loss = build(Loss, LOSS, {})
 
     def render(
@@ -65,14 +68,16 @@ def renders_of(
 
 
 def parameters_in_a_run(parameters: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-    """Return the same tensors in the mapping type of a run's context."""
+    """Return the tensors in the mapping type that the contexts of a run use."""
     return TrainState(tensors=dict(parameters), moments=AdamState(), rngs={}).current
 
 
 def gaussians_in_a_run(gaussians: Gaussians, backbone: Backbone) -> Gaussians:
-    """Return the same Gaussians with on-demand rows for tensors that the backbone passes through.
+    """Return the Gaussians in the form that a training run uses.
 
-    All rows are up to date here, so bringing rows has no effect.
+    Tensors that the backbone passes through have on-demand rows.
+
+    In the returned Gaussians, all rows are up to date, so that a request for rows does nothing.
     """
     fields = frozenset(f for f in backbone.passthrough if getattr(gaussians, f) is not None)
     return replace(gaussians, on_demand=OnDemand(fields, lambda _: None)).whole()
@@ -81,14 +86,16 @@ def gaussians_in_a_run(gaussians: Gaussians, backbone: Backbone) -> Gaussians:
 def view_record(
     view: View, gaussians: Gaussians, screen: Screen, index: int = 0, scale: float = 1.0
 ) -> ViewRecord:
-    """Make the record of a view with these statistics, over black, with a black photo.
+    """Create the record of a view with given statistics.
+
+    The photo, the render and the background of the record are black.
 
     Args:
         view: The view.
         gaussians: The rendered Gaussians.
-        screen: Statistics of the Gaussians in pixels of the render, gradients included.
-        index: Position of the view in `scene.train_views`.
-        scale: Side of the render divided by the side of the photo.
+        screen: Statistics of the Gaussians, including gradients, in pixels of the render.
+        index: Position of the view in the training views.
+        scale: Side length of the render, divided by the side length of the photo.
     """
     camera = camera_at(view.camera, scale)
     image = torch.zeros(camera.height, camera.width, 3)

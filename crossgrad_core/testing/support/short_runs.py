@@ -1,4 +1,4 @@
-"""Short runs on the sample scene, which are either refused with reasons or trained."""
+"""Short runs on the sample scene. A run is either refused with reasons, or trained."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,18 +21,18 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state
 from crossgrad_core.wording import listed
 
-#: Upper limit of losses. Losses of images in [0, 1] are far below this limit.
+#: Largest allowed loss. For images in [0, 1], losses are far below this number.
 _LARGEST_LOSS = 10.0
 
 
 @dataclass(frozen=True)
 class ShortRun:
-    """The parameters and records of a few steps.
+    """The parameters before, during and after a few steps, and the records of these steps.
 
     Attributes:
         before: Parameters before the first step.
         early: Parameters after the first step.
-        after: Parameters at the end.
+        after: Parameters after the last step.
         records: The record of each step.
     """
 
@@ -48,15 +48,15 @@ class ShortRun:
 
 
 def reasons_to_refuse(config: RunConfig) -> tuple[str, ...]:
-    """Return the reasons to refuse a run before training; empty if it is accepted.
+    """Return the reasons why a run is refused before training; empty if the run is accepted.
 
-    A combination is refused if a component objects (`crossgrad_validate_selection`), or if the
-    declarations of its components do not match in numbers of views, tensors, statistics or devices.
+    A component may refuse the selection (`crossgrad_validate_selection`). A run is also refused if
+    the numbers of views, tensors, statistics or devices that its components declare do not match.
     """
     config, *_ = with_decisions(config, sample_scene())
     selection, _ = select(config, sample_scene(), "none")
-    # Do not register the observer with the manager, because registration would take most of the
-    # time.
+    # Call the hooks of observers directly, because registering observers with a manager would take
+    # most of the time.
     observers = [build(Observer, choice.name, choice.options) for choice in config.observers]
     plugins = (*selection.plugins.values(), *observers)
     asked = (getattr(plugin, "crossgrad_validate_selection", None) for plugin in plugins)
@@ -65,10 +65,10 @@ def reasons_to_refuse(config: RunConfig) -> tuple[str, ...]:
 
 
 def setup_of(config: RunConfig) -> Setup:
-    """Assemble the run of a configuration on the sample scene.
+    """Create the setup of a configuration for the sample scene.
 
     Raises:
-        IncompatibleSelectionError: The configuration is refused.
+        IncompatibleSelectionError: The configuration is refused before training.
     """
     return assemble(config, sample_scene(), "none")
 
@@ -89,7 +89,7 @@ def _copied(parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def require_sound(run: ShortRun) -> None:
-    """Require finite losses and parameters, and that the first step changes a parameter."""
+    """Require finite losses and parameters. The first step must change a parameter."""
     for step, record in enumerate(run.records, 1):
         good = all(0.0 <= loss < _LARGEST_LOSS for loss in record.losses)
         require(good, f"step {step}: the losses are {record.losses}; expected 0 to 10")
@@ -100,7 +100,7 @@ def require_sound(run: ShortRun) -> None:
 
 
 def require_repeated(run: ShortRun, again: ShortRun) -> None:
-    """Require that two runs with one seed are equal to the bit."""
+    """Require that two runs with equal seeds give bit-identical results."""
     for step, (one, other) in enumerate(zip(run.records, again.records, strict=True), 1):
         for what in ("views", "losses", "counts"):
             pair = getattr(one, what), getattr(other, what)
@@ -120,11 +120,12 @@ def require_repeated(run: ShortRun, again: ShortRun) -> None:
 
 
 def try_out(config: RunConfig, steps: int) -> None:
-    """Train a run for some steps, twice, and check the results.
+    """Train the first steps of a run twice, and check the results.
 
     Raises:
-        ContractError: A loss or parameter is not finite, nothing is trained, or the runs differ.
-        UserError: The run cannot start, or a plugin gives a wrong answer.
+        ContractError: A loss or parameter is not finite, no parameter changes, or the two runs
+            differ.
+        UserError: The run cannot start, or a plugin returns an invalid result.
     """
     setup = setup_of(config)
     with on_one_thread():

@@ -17,7 +17,8 @@ from crossgrad_core.training.adam.coefficients import (
     Coefficients,
 )
 
-#: A tensor with its gradient, its moments and its step.
+#: Elements: the parameter, its gradient, its first and second moments, and the coefficients of the
+#: step.
 Update: TypeAlias = tuple[Tensor, Tensor, Tensor, Tensor, Coefficients]
 
 
@@ -32,31 +33,34 @@ def adam_step(  # noqa: PLR0913 - all options of an optimizer step are arguments
     *,
     from_zero: Collection[str] = (),
 ) -> None:
-    """Take one Adam step on every tensor with a gradient, in place on `params` and `state`.
+    """Take one Adam step on every tensor that has a gradient; `params` and `state` change in place.
 
-    A tensor without gradient (None or absent) keeps value, moments and step count. Gradients too
-    small or too large for float32 arithmetic are limited by the constants in `coefficients`. Within
-    [1e-17, 1e18] the result equals `torch.optim.Adam` up to rounding. As in torch, a NaN in a
-    gradient makes its element NaN.
+    A tensor without a gradient (None or absent) keeps its value, moments and step count. The
+    constants in `coefficients` limit gradients that are too small or too large for float32
+    arithmetic. For gradients of magnitude 1e-17 to 1e18, the result equals `torch.optim.Adam` up to
+    rounding. As in torch, a NaN element of a gradient makes the corresponding element of the
+    parameter NaN.
 
     Args:
         params: Floating-point tensors of any shape, by name.
-        grads: Gradients of the same shapes and types.
+        grads: Gradients with the shapes and types of `params`, by name.
         state: Moments and step counts; missing entries start at zero.
         lrs: Learning rate of every tensor that has a gradient.
-        rule: Decays of the moments, and eps.
-        scales: Tensor name -> factor for the gradient, not 0. None means 1 for all tensors.
-        from_zero: Names of uninitialised tensors with a gradient; they count as zero before the
-            step.
+        rule: Decay rates of the moments, and eps.
+        scales: Factor for the gradient of each tensor, by name; not 0. None means a factor of 1 for
+            all tensors.
+        from_zero: Names of uninitialised tensors that have a gradient. The values of these tensors
+            are set to zero before the step.
 
     Raises:
-        ValueError: If an argument is out of range or a gradient does not fit its tensor.
+        ValueError: If an argument is out of range or a gradient does not have the shape and type of
+            its tensor.
 
     Source: Kingma and Ba 2015, algorithm 1.
     """
     _check(params, grads, rule.betas)
     given = {name: grad for name in params if (grad := grads.get(name)) is not None}
-    # Look up the coefficients before the first step is counted.
+    # A missing learning rate must raise its error before any step is counted.
     numbers = {name: (lrs[name], 1.0 if scales is None else scales[name]) for name in given}
     updates = []
     for name, grad in given.items():
@@ -70,12 +74,12 @@ def adam_step(  # noqa: PLR0913 - all options of an optimizer step are arguments
 def counted(
     name: str, param: Tensor, state: AdamState, lr: float, rule: AdamRule, scale: float
 ) -> Coefficients:
-    """Count one more step of a tensor and return the coefficients of the step.
+    """Increase the step count of a tensor and return the coefficients of the step.
 
     Args:
         name: Name of the tensor.
         param: The tensor.
-        state: Moments and step counts; changed.
+        state: Moments and step counts; the entries of the tensor change.
         lr: Learning rate.
         rule: The Adam rule, as in `adam_step`.
         scale: Factor for the gradient.
@@ -89,7 +93,7 @@ def counted(
 
 
 def update_tensors(updates: Iterable[Update]) -> None:
-    """Apply one step to tensors and their moments: fused for float32 on the CPU, else by torch."""
+    """Apply one step to each tensor with a fused kernel (float32 on the CPU), else with torch."""
     fused = []
     for update in updates:
         param, grad, exp_avg, exp_avg_sq, step = update
@@ -111,14 +115,15 @@ def update_tensors(updates: Iterable[Update]) -> None:
 def _update_fused(updates: Sequence[Update]) -> None:
     from crossgrad_core.training.adam.numba_kernels.fused import update_at
 
-    # Keep references until the step is done. Otherwise, the copies would be freed too early.
+    # The kernel receives only addresses. Keep references until the step is done. Without these
+    # references, the contiguous copies of gradients would be freed too early.
     laid_out = [(p, g.contiguous(), m, v) for p, g, m, v, _ in updates]
     addresses = [[tensor.data_ptr() for tensor in four] for four in laid_out]
     sizes = [param.numel() for param, *_ in laid_out]
     update_at(addresses, sizes, [step for *_, step in updates])
     # NumPy wrote without autograd, so invalidate graphs that use the old values.
     for param, _, exp_avg, exp_avg_sq, _ in updates:
-        # Older versions of torch accept only one tensor at a time.
+        # Older versions of torch accept only one tensor in each call.
         for tensor in (param, exp_avg, exp_avg_sq):
             torch.autograd.graph.increment_version(tensor)
 
@@ -126,10 +131,12 @@ def _update_fused(updates: Sequence[Update]) -> None:
 def update_on_gpu(
     param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, step: Coefficients
 ) -> None:
-    """Apply the same step with torch's fused Adam, which keeps subnormal numbers.
+    """Apply one step with torch's fused Adam.
 
-    Steps on a GPU do not check for infinite gradients. An infinite gradient makes the parameter
-    NaN, which the check of parameters finds.
+    In contrast to the CPU kernel, torch's Adam keeps subnormal numbers.
+
+    On a GPU, a step does not check for infinite gradients. An infinite gradient makes the parameter
+    NaN, and the check of the parameters reports this NaN.
     """
     grad = grad if step.scale == 1.0 else grad * step.scale
     grad = grad.nan_to_num(nan, nan, nan).clamp(-LARGEST, LARGEST)
@@ -139,7 +146,7 @@ def update_on_gpu(
         [exp_avg],
         [exp_avg_sq],
         [],
-        # The function adds 1 to the step count first.
+        # torch's Adam first adds 1 to the step count.
         [torch.full((), step.age - 1, dtype=torch.float32, device=param.device)],
         fused=True,
         amsgrad=False,
@@ -155,7 +162,7 @@ def update_on_gpu(
 def update_reference(
     param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, step: Coefficients
 ) -> None:
-    """Apply the same step in plain torch, for any device and floating-point type."""
+    """Apply one step with plain torch operations, for any device and floating-point type."""
     grad = grad if step.scale == 1.0 else grad * step.scale
     grad = _without(grad.clamp(-LARGEST, LARGEST), TINY)
     exp_avg.mul_(step.beta1).add_(grad, alpha=1 - step.beta1)
@@ -168,7 +175,7 @@ def update_reference(
 
 
 def _without(values: Tensor, floor: float) -> Tensor:
-    """Return the values, with 0 if the absolute value is below `floor`; NaN is kept."""
+    """Return the values, but 0 if the absolute value is below `floor`; NaN stays NaN."""
     return torch.where(values.abs() < floor, torch.zeros_like(values), values)
 
 

@@ -1,8 +1,8 @@
-"""Position steps in units of the Gaussians: along each axis, by a share of its length.
+"""Position steps in proportion to the size of each Gaussian, separately along each of its axes.
 
-Adam gives every position steps of the same length. With such steps, a small Gaussian on a near wall
-jumps over its neighbours, while a large Gaussian on the ground below a drone hardly moves. Scenes
-with very different camera distances contain both kinds (docs/schedules.md).
+Adam gives all positions steps of about equal length. With equal steps, a small Gaussian on a near
+wall jumps over its neighbours, while a large Gaussian on the ground below a drone hardly moves. A
+scene with very different camera distances contains small and large Gaussians (docs/schedules.md).
 """
 
 from math import inf, log, nan
@@ -15,24 +15,26 @@ from torch import Tensor
 from crossgrad_core.gradients.columns import is_native
 from crossgrad_core.numerics.rotations import rotation_matrices
 
-#: Maximum ratio of an axis length to the typical axis length. The inverse ratio has the same limit.
+#: Maximum ratio of an axis length to the typical axis length. The minimum ratio is the inverse of
+#: this number.
 LIMIT: Final = 5.0
-#: Largest number of Gaussians that are sampled for the typical length.
+#: Largest number of Gaussians in the sample for the typical axis length.
 _SAMPLE = 1024
 
 
 @torch.no_grad()
 def step_along_axes(positions: Tensor, steps: Tensor, scales: Tensor, quats: Tensor) -> None:
-    """Add steps to positions in place, stretched along the axes of their Gaussians.
+    """Add steps to positions in place, after stretching each step along the axes of its Gaussian.
 
-    A step keeps its length along an axis of typical length. Each Gaussian has three axis lengths.
-    The typical length is the median of the middle lengths over all Gaussians.
+    The length of a step does not change along an axis of typical length. Each Gaussian has three
+    axis lengths. The typical length is a median over all Gaussians. The median is computed over the
+    middle of the three axis lengths of each Gaussian.
 
     Args:
         positions: [N, 3].
-        steps: [N, 3], as Adam would take them.
-        scales: [N, 3] logarithms of the standard deviations along the axes.
-        quats: [N, 4] rotations, wxyz of any length.
+        steps: [N, 3] steps that Adam would take.
+        scales: [N, 3] logarithms of the standard deviations along the three axes.
+        quats: [N, 4] rotations as quaternions (w, x, y, z) of any length.
 
     Source: developed for crossgrad.
     """
@@ -52,21 +54,22 @@ def step_along_axes(positions: Tensor, steps: Tensor, scales: Tensor, quats: Ten
 
 
 def stretched(steps: Tensor, factors: Tensor, quats: Tensor) -> Tensor:
-    """Return the steps [N, 3] times factors [N, 3] along the axes of rotations `quats` [N, 4]."""
+    """Return steps [N, 3], scaled by `factors` [N, 3] along the axes of rotations `quats`."""
     rotations = rotation_matrices(quats)
     along = torch.einsum("nji,nj->ni", rotations, steps)
     return torch.einsum("nij,nj->ni", rotations, factors * along)
 
 
 def _usual(scales: Tensor) -> Tensor | float:
-    """Return the median middle log scale of Gaussians that are evenly spread over memory.
+    """Return the median of the Gaussians' middle log scales, computed over a sample.
 
-    Non-finite values are left out, so that they do not affect other Gaussians.
+    The sample is evenly spread over the rows. Non-finite values are left out, because a NaN median
+    would affect all Gaussians.
     """
     sample = scales[:: -(-len(scales) // _SAMPLE)]
-    if is_native([sample]):  # Use NumPy, because it has less overhead than torch.
+    if is_native([sample]):  # For this small sample, NumPy has less overhead than torch.
         rows = sample.numpy()
-        # Sort NaN to the end, as torch does.
+        # Replace NaN by infinity, so that NaN is sorted to the end, as in torch.
         a, b, c = np.where(np.isnan(rows), np.float32(inf), rows).T
         lengths = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
         lengths = lengths[np.isfinite(lengths)]

@@ -1,12 +1,12 @@
-"""Deferred Adam steps: rows that no view of a step rendered take their step later, when needed.
+"""Deferred Adam steps: a row that no view of a step rendered takes this step later.
 
-Such a row has a gradient of zero, but Adam still moves it by its decaying moments. The deferred
-steps are applied row by row when the row is next rendered, or to all rows when the tensor is read.
-The deferred steps use the same float32 operations in the same order, so the bits are the same as
-without deferral.
+A row that was not rendered has a gradient of zero, but Adam still moves the row by its decaying
+moments. The deferred steps of a row are applied when the row is next rendered, or when the whole
+tensor is read. Deferred steps use the float32 operations of immediate steps, in the same order.
+Deferred and immediate steps therefore give bit-identical results.
 
-Steps run in the background on other threads while this thread continues with serial work. Code that
-reads the tensor, for a render or on request, waits until the step is complete.
+Steps run in background threads while the calling thread continues with serial work. Code that reads
+the tensor waits until the step is complete.
 """
 
 from dataclasses import dataclass, field
@@ -26,12 +26,12 @@ from crossgrad_core.training.adam.coefficients import Coefficients
 if TYPE_CHECKING:
     from crossgrad_core.numerics.jobs import Begun
 
-#: Largest number of deferred steps of a row, so that tables stay short.
+#: Largest number of deferred steps of a row. The limit keeps the tables of steps short.
 LONGEST: Final = 256
-#: If at least this share of the rows takes a step, all rows take it in memory order, because
-#: deferred updates would take longer.
+#: If at least this share of the rows has a gradient, all rows take the step in memory order.
+#: With a larger share, deferred updates would take longer.
 MOST_ROWS: Final = 0.15
-#: With a smaller beta2, second moments may vanish before the kernel checks again.
+#: With a smaller beta2, second moments may become 0 before the kernel checks the parameters again.
 LEAST_BETA2: Final = 0.5
 
 
@@ -41,8 +41,10 @@ class _Behind:
 
     Attributes:
         done: [N] number of steps that each row has taken.
-        before: Number of steps before the first step in `room`; every row has taken these steps.
-        room: [LONGEST, 5] both betas, step size, scale of the root and eps of each later step.
+        before: Number of steps before the first step in `room`. Every row has taken these earlier
+            steps.
+        room: [LONGEST, 5] both betas, step size, scale of the square root, and eps of each later
+            step.
         count: Number of steps in `room`.
     """
 
@@ -52,21 +54,22 @@ class _Behind:
     count: int = 0
 
     def add(self, *numbers: float) -> None:
-        """Add a step."""
+        """Add the coefficients of one step."""
         self.room[self.count] = numbers
         self.count += 1
         vars(self).pop("table", None)
 
     @cached_property
     def table(self) -> NDArray[np.float32]:
-        """The steps as a flat table for the kernel."""
+        """The steps as a one-dimensional table for the kernel."""
         steps = self.room[: self.count]
-        # Upper and lower bounds over each step and all later steps.
+        # For each step: the largest step size and the smallest root scale of this step and all
+        # later steps.
         later = steps[::-1]
         most = np.maximum.accumulate(later[:, 2])[::-1]
         least = np.minimum.accumulate(later[:, 3])[::-1]
-        # The bound is valid under two conditions: the first moment decays faster than the root of
-        # the second moment, and the second moment stays a normal number between two checks.
+        # The bounds are valid if the first moment decays faster than the square root of the second
+        # moment. In addition, the second moment must stay a normal number between two checks.
         beta1, beta2 = steps[:, 0], steps[:, 1]
         fades = bool(((beta1 <= np.sqrt(beta2)) & (beta2 >= LEAST_BETA2)).all())
         most = most if fades else np.full_like(most, inf)
@@ -74,7 +77,7 @@ class _Behind:
 
 
 class Late:
-    """The deferred steps of rows of tensors, by tensor name."""
+    """The deferred steps of all tensors, by name of the tensor."""
 
     def __init__(self) -> None:
         self._behind: dict[str, _Behind] = {}
@@ -82,23 +85,24 @@ class Late:
 
     @property
     def names(self) -> frozenset[str]:
-        """The tensors with deferred steps of rows, or with a step that still runs."""
+        """The names of tensors that have deferred steps or a step that is still running."""
         return frozenset(self._behind).union(self._under_way)
 
     def finish(self, name: str | None = None) -> None:
-        """Wait until no step is running; deferred steps remain deferred.
+        """Wait until no step is running. Deferred steps remain deferred.
 
         Args:
-            name: The tensor; None means all tensors.
+            name: Name of the tensor to wait for; None means all tensors.
         """
         for tensor_name in [name] if name is not None else list(self._under_way):
             if (begun := self._under_way.get(tensor_name)) is not None:
-                # Keep the failed step, so that it raises its error again.
+                # If the step failed, `end` raises its error. The failed step stays in the table, so
+                # that the next call raises the error again.
                 begun.end()
                 del self._under_way[tensor_name]
 
     def forget(self) -> None:
-        """Discard all steps; no thread changes a tensor after the return."""
+        """Discard all running and deferred steps. No thread changes a tensor after this call."""
         for begun in self._under_way.values():
             begun.leave()
         self._under_way, self._behind = {}, {}
@@ -106,16 +110,19 @@ class Late:
     def step(
         self, name: str, param: Tensor, grad: Tensor, adam: AdamState, step: Coefficients
     ) -> None:
-        """Take a step with the rows of `grad` (sparse) and defer the step of all other rows.
+        """Take a step with the rows of the sparse gradient `grad`.
 
-        If `grad` contains many rows, all rows take the step and no row is deferred. The step may
-        still run after the return; `finish` waits for it.
+        Defer the step of all other rows.
+
+        If `grad` contains many rows, all rows of the tensor take the step at once. The step may
+        still be running after this function returns; `finish` waits for the end of the step.
 
         Args:
-            name: Name of the tensor; its count in `adam` includes this step.
+            name: Name of the tensor. The step count of the tensor in `adam` already includes this
+                step.
             param: The tensor, float32 and contiguous, on the CPU.
-            grad: The sparse gradient, which must not change any more.
-            adam: Moments and counts.
+            grad: The sparse gradient. The gradient must not change after this call.
+            adam: Moments and step counts.
             step: The coefficients of the step.
         """
         from crossgrad_core.numerics.jobs import Begun
@@ -147,13 +154,14 @@ class Late:
     def catch_up(
         self, name: str, param: Tensor, adam: AdamState, rows: Tensor | None = None
     ) -> None:
-        """Apply the deferred steps of rows of a tensor.
+        """Apply the deferred steps of some or all rows of a tensor.
 
         Args:
             name: Name of the tensor.
             param: The tensor.
-            adam: Moments and counts.
-            rows: [R] int32 without duplicates; None means all rows; then no step remains deferred.
+            adam: Moments and step counts.
+            rows: [R] int32 row numbers without duplicates. If `rows` is None, all rows are updated,
+                and no step remains deferred.
         """
         self.finish(name)
         behind = self._behind.get(name)
@@ -163,7 +171,7 @@ class Late:
             from crossgrad_core.numerics.jobs import Begun
             from crossgrad_core.training.adam.numba_kernels.late import catch_up
 
-            # Always use the same type, because another type would compile the kernel again.
+            # Always pass an int32 array, because another type would compile the kernel again.
             which = np.empty(0, np.int32) if rows is None else rows.numpy()
             flat, width = _flat(name, param, adam), _width(param)
             steps, before = behind.table, behind.before
@@ -178,17 +186,17 @@ class Late:
 
 
 def _flat(name: str, param: Tensor, adam: AdamState) -> tuple[NDArray[np.float32], ...]:
-    """Return the tensor and its moments as flat arrays."""
+    """Return the tensor and its two moments as one-dimensional arrays."""
     tensors = (param, adam.exp_avg[name], adam.exp_avg_sq[name])
     return tuple(tensor.detach().view(-1).numpy() for tensor in tensors)
 
 
 def _width(param: Tensor) -> int:
-    """Return the number of elements of a row."""
+    """Return the number of elements in a row of the tensor."""
     return param.numel() // max(1, param.shape[0])
 
 
 def _changed(name: str, param: Tensor, adam: AdamState) -> None:
-    """Invalidate graphs that contain the old values, because NumPy wrote without autograd."""
+    """Tell autograd that NumPy has changed the tensor and its moments."""
     for tensor in (param, adam.exp_avg[name], adam.exp_avg_sq[name]):
         torch.autograd.graph.increment_version(tensor)

@@ -1,4 +1,4 @@
-"""Means over the areas that the pixels of a smaller image cover (Numba, CPU)."""
+"""Reduce an image: each new pixel is the mean of an area of the image (Numba, CPU)."""
 
 from math import ceil
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import kernel
 
-#: A pixel of the smaller image counts if at least this share of its area counts.
+#: A new pixel is valid if at least this share of its area consists of valid pixels.
 _COUNTS = 0.5
 
 
@@ -18,13 +18,16 @@ def reduce_by_area(
     small: NDArray[np.uint8],
     counts: NDArray[np.bool_],
 ) -> None:
-    """Write the mean of the area of each new pixel; the order of all sums is fixed.
+    """Write the mean of the area of each new pixel.
+
+    The order of all sums is fixed, so that results are repeatable.
 
     Args:
-        image: [H, 3 W], contiguous.
-        kept: [H, W], pixels that count; [0, 0] if all pixels count.
-        small: [h, w, 3], h <= H and w <= W: the means; 0 if no pixel of the area counts.
-        counts: [h, w], new pixels that count.
+        image: [H, 3 W] rows of interleaved RGB values, contiguous.
+        kept: [H, W] True for valid pixels; shape [0, 0] if all pixels are valid.
+        small: [h, w, 3] output, h <= H and w <= W: the mean over valid pixels, or 0 without a valid
+            pixel.
+        counts: [h, w] output, True for valid new pixels.
     """
     masked = kept.size > 0
     rows, columns = counts.shape

@@ -15,12 +15,12 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: Name of the plugin state. It is kept between steps and in checkpoints.
+#: Name of the plugin state. The state is kept between steps and in checkpoints.
 STATE = "clip"
 
 
 class Clip(Observer):
-    """A wrapper that shortens a block's aggregated gradient to `max_norm` if it is longer."""
+    """Shortens the aggregated gradient of a block to `max_norm` if it is longer."""
 
     max_norm: float = Field(1.0, gt=0.0, description="maximum length of a block's gradient")
 
@@ -28,7 +28,7 @@ class Clip(Observer):
     def crossgrad_aggregate_gradients(
         self, context: AggregateContext
     ) -> Generator[None, AggregateResult, AggregateResult]:
-        """Let the operator aggregate, then clip its result."""
+        """Let the operator aggregate, then clip the operator's result."""
         aggregated = yield
         gradients, clipped = dict(aggregated.gradients), 0
         for block in context.blocks:

@@ -6,7 +6,7 @@ from crossgrad_core.plugin import Field, PluginState, Resolution, ScaleContext
 
 
 class CoarseFirst(Resolution):
-    """A smaller scale for rendering and comparison in the first part of the run."""
+    """Renders and compares smaller photos in the first part of the run."""
 
     scale: float = Field(0.5, gt=0, le=1, description="scale at the start of the run")
     share: float = Field(0.25, ge=0, le=1, description="share of the steps that use this scale")

@@ -1,4 +1,4 @@
-"""An operator in which every view has the same influence, for gradients of any length."""
+"""An operator in which every view has the same influence, even if gradients differ in length."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""A recipe that changes one row of another recipe."""
+"""A recipe that changes one decision of another recipe."""
 
 from typing_extensions import override
 
@@ -6,7 +6,7 @@ from crossgrad_core.plugin import Decision, Facts, Recipe, build_component, with
 
 
 class Gentle(Recipe):
-    """A recipe that decides like `auto`, but at the published learning rates."""
+    """Decides like recipe `auto`, but uses the published learning rates."""
 
     @override
     def decide(self, facts: Facts) -> list[Decision]:

@@ -9,7 +9,7 @@ from crossgrad_core.plugin import PluginState, SampleContext, Sampler, ViewSampl
 
 
 class LeastSeen(Sampler):
-    """A sampler that draws the K least often rendered training views; ties are broken at random."""
+    """Draws the K training views that were rendered least often; ties are broken at random."""
 
     default_views: ClassVar[int] = 2
 

@@ -17,7 +17,7 @@ from crossgrad_core.plugin import (
 
 
 class MedianDistance(Grouping):
-    """Views are near if the camera is within the median distance of the mean camera, else far."""
+    """Views whose camera is within the median distance of the mean camera are near, else far."""
 
     @override
     def fit(

@@ -1,4 +1,4 @@
-"""An initializer that adds a dome over the scene, for parts without SfM points."""
+"""An initializer that adds a dome of points over the scene, for parts without SfM points."""
 
 import numpy as np
 from typing_extensions import override
@@ -7,15 +7,15 @@ from crossgrad_core.plugin import Field, Initializer, MorePoints, Scene
 
 
 class Sky(Initializer):
-    """Blue points on the upper half of a sphere around the cameras; z is up."""
+    """Blue points on the upper half of a sphere around the cameras; z points up."""
 
     radius: float = Field(10.0, gt=0.0, description="radius of the dome, scene extents")
     count: int = Field(200, ge=1, description="points")
 
     @override
     def more_points(self, scene: Scene) -> MorePoints | None:
-        # Place the points on a spiral with equal areas, in which neighbouring points differ by the
-        # golden angle.
+        # Place the points on a spiral with equal areas; neighbouring points differ by the golden
+        # angle.
         height = (np.arange(self.count) + 0.5) / self.count
         angle = np.arange(self.count) * np.pi * (3.0 - np.sqrt(5.0))
         flat = np.sqrt(1.0 - height**2)

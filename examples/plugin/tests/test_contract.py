@@ -1,4 +1,4 @@
-"""The contract checks of each slot: two lines per plugin."""
+"""The contract checks of each slot, with two lines per plugin."""
 
 import pytest
 from crossgrad_example.borrowed import Borrowed

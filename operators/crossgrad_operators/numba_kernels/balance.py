@@ -1,7 +1,7 @@
-"""Equal projections and bargaining (IMTL-G, Nash-MTL), and equal singular values (Aligned-MTL).
+"""Kernels for equal projections (IMTL-G), bargaining (Nash-MTL), equal singular values (Aligned).
 
-Each kernel computes with 16 or 32 digits. Each kernel also marks the blocks for which rounding of
-the Gramian may be visible in a 16-digit result.
+Each kernel can compute with 16 or with 32 digits. Each kernel marks the blocks for which rounding
+of the Gramian may affect a result with 16 digits.
 """
 
 import math
@@ -41,16 +41,17 @@ from crossgrad_operators.numba_kernels.normal import (
     Indices,
 )
 
-#: Maximum number of Newton steps of Nash-MTL. About ten are usual.
+#: Maximum number of Newton steps of Nash-MTL. About ten steps are usually enough.
 STEPS = 200
-#: The iteration ends at this Newton decrement.
+#: The iteration ends when the Newton decrement is below this value.
 DECREMENT = 1e-13
-#: Below this Newton decrement, whole steps converge quadratically.
+#: Below this Newton decrement, full Newton steps converge quadratically.
 CLOSE = 0.25
-#: The bargaining problem diverges if beta is above this value. A beta above 7e5 sqrt(K) already
-#: counts as zero by the limit `CANCELLED`.
+#: If beta exceeds this value, the bargaining problem has no finite solution. If beta exceeds 7e5
+#: sqrt(K), the limit `CANCELLED` already sets the result to zero.
 ENDLESS = 3e7
-#: Maximum number of final Newton steps with 32 digits. Two steps are enough up to a kappa of 1e5.
+#: Maximum number of additional Newton steps with 32 digits. For a condition number kappa of at most
+#: 1e5, two steps are enough.
 POLISHING = 20
 
 
@@ -70,10 +71,12 @@ def _of_present(
 
 @strict_device
 def _graded(norms: Pairs, cosines: Pairs, exact: Exact) -> Pairs:
-    """Return D C D [n, n], where D contains the norms divided by the largest norm.
+    """Return D C D [n, n] for the cosines C.
 
-    The matrix has the rank of C. At large norm ratios, the eigenvalues of D C D would not show this
-    rank.
+    The diagonal matrix D contains the norms, divided by the largest norm.
+
+    D C D and C have equal ranks. If the ratio of norms is large, the eigenvalues of D C D do not
+    show this rank.
     """
     n = len(norms)
     longest, _ = longest_of(norms)
@@ -89,7 +92,7 @@ def _graded(norms: Pairs, cosines: Pairs, exact: Exact) -> Pairs:
 
 @strict_device
 def _add(out: Pairs, factor: Pair, vector: Pairs, exact: Exact) -> None:
-    """Add a vector times a factor to `out`."""
+    """Add `factor` times `vector` to `out`."""
     for k in range(len(out)):
         put(out, k, plus(at(out, k), product(factor, at(vector, k), exact), exact))
 
@@ -104,10 +107,12 @@ def _add_solution(
     v: Pairs,
     exact: Exact,
 ) -> None:
-    """Add x_i (x_i.r) / l_i for the chosen eigenvectors x_i and eigenvalues l_i to `v`.
+    """Add x_i (x_i.r) / l_i to `v` for the chosen eigenvectors x_i.
 
-    An eigenvector is skipped if the terms of x_i.r cancel up to a share `least`, because the
-    eigenvector is then orthogonal to r except for rounding noise.
+    The l_i are the eigenvalues, and r is the right-hand side.
+
+    An eigenvector x_i is skipped if |x_i.r| is at most `least` times the sum of the magnitudes of
+    its terms. A skipped eigenvector is orthogonal to r, except for rounding noise.
     """
     for i in chosen:
         inner = products(vectors[:, i], right, 0, len(v), exact)
@@ -120,10 +125,12 @@ def _add_solution(
 
 @strict_part
 def _equal_projections(norms: Pairs, cosines: Pairs, v: Pairs, exact: Exact) -> float:
-    """Solve G v = (|g_k|), by the shortest least-squares solution if G is singular.
+    """Solve G v = (|g_k|) for v.
+
+    If G is singular, v is the least-squares solution with the smallest norm.
 
     Returns:
-        The ratio of the smallest to the largest eigenvalue of the cosines.
+        The smallest eigenvalue of the cosine matrix, divided by the largest.
     """
     n = len(norms)
     matrix, vectors = cosines.copy(), np.empty((n, n, 2))
@@ -152,17 +159,17 @@ def _equal_projections(norms: Pairs, cosines: Pairs, v: Pairs, exact: Exact) -> 
 def imtl_g(
     gramians: Floats, rounding_residuals: Floats, present: Flags, unit: float, exact: Exact
 ) -> Solved:
-    """Return weights with sum 1 that give u equal projections on all unit gradients.
+    """Return weights with sum 1 whose combination has equal projections on all unit gradients.
 
     Args:
-        gramians: [B, K, K].
-        rounding_residuals: [B, K, K] rounding residuals of the Gramians, unused for 16 digits.
-        present: [B, K].
-        unit: Relative error above which a result of 16 digits is ill-conditioned.
-        exact: True for 32 digits, None for 16.
+        gramians: [B, K, K] Gramians.
+        rounding_residuals: [B, K, K] rounding residuals of the Gramians; unused with 16 digits.
+        present: [B, K] True for views that have a gradient.
+        unit: Largest relative error for which a result with 16 digits is accepted.
+        exact: True for 32 digits, None for 16 digits.
 
     Returns:
-        [B, K] weights and [B] True for ill-conditioned weights.
+        [B, K] weights, and [B] True for ill-conditioned weights.
     """
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
@@ -184,9 +191,9 @@ def imtl_g(
 def _same_shares(
     norms: Pairs, cosines: Pairs, places: Indices, unit: float, weights: Floats, exact: Exact
 ) -> bool:
-    """Fill in the weights of more than two views.
+    """Write the weights of more than two views to `weights`.
 
-    Return True if these weights are ill-conditioned.
+    Return True if the weights are ill-conditioned.
     """
     n = places.size
     longest, _ = longest_of(norms)
@@ -200,7 +207,8 @@ def _same_shares(
         sizes += abs(v[i, 0])
         largest = max(largest, abs(v[i, 0]))
         put(x, i, product(at(v, i), at(scaled, i), exact))
-    # The sum of v, or the sum of v times the gradients, may consist only of rounding noise.
+    # The sum of v, or the weighted sum of the gradients, may be only rounding noise. If one of
+    # these sums is only rounding noise, all weights stay zero.
     if total[0] * total[0] > CANCELLED * largest * largest and not cancels(x, cosines, exact):
         for i in range(n):
             weights[places[i]] = quotient(at(v, i), total, exact)[0]
@@ -209,7 +217,10 @@ def _same_shares(
 
 @strict_device
 def _newton_step(cosines: Floats, beta: Floats, matrix: Floats, step: Floats) -> float:
-    """Fill in Newton's step of the bargain, in units of beta, and return its decrement."""
+    """Write the Newton step of the bargaining problem, in units of beta, to `step`.
+
+    Return the Newton decrement.
+    """
     n = beta.size
     slope = np.empty(n)
     for i in range(n):
@@ -227,18 +238,18 @@ def _newton_step(cosines: Floats, beta: Floats, matrix: Floats, step: Floats) ->
 
 @strict_kernel
 def bargain(cosines: Floats, beta: Floats) -> bool:
-    """Solve C beta = 1 / beta for beta > 0 by damped Newton steps.
+    """Solve C beta = 1 / beta for beta > 0 by damped Newton steps, with the cosine matrix C.
 
     Return False if the iteration diverges.
 
-    The objective 1/2 beta^T C beta - sum log beta is self-concordant, so steps of 1 / (1 +
-    decrement) converge from any start. In units of beta the Hessian is 1 + B C B, so a damped step
-    never makes a component of beta zero. If a sum of directions with non-negative weights is zero,
-    beta grows without limit.
+    The objective 1/2 beta^T C beta - sum log beta is self-concordant. Steps of length 1 / (1 +
+    decrement) therefore converge from any start. In units of beta, the Hessian is 1 + B C B with B
+    = diag(beta). A damped step therefore never makes an element of beta zero. If some sum of the
+    directions with non-negative weights is zero, beta grows without limit.
 
     Args:
-        cosines: [n, n].
-        beta: [n] solution.
+        cosines: [n, n] cosines C of the gradients.
+        beta: [n] output, the solution.
     """
     n = beta.size
     total = cosines.sum()
@@ -252,7 +263,8 @@ def bargain(cosines: Floats, beta: Floats) -> bool:
             beta[i] *= 1.0 + damping * step[i]
         if beta.max() > ENDLESS:
             return False
-        # After a full step, the decrement is squared, until rounding stops the convergence.
+        # After each full step, the decrement is about the square of the previous decrement, until
+        # rounding ends the convergence.
         if decrement <= DECREMENT or decrement > 0.5 * last:
             return True
         last = decrement if decrement <= CLOSE else np.inf
@@ -261,7 +273,7 @@ def bargain(cosines: Floats, beta: Floats) -> bool:
 
 @strict_part
 def _polish(cosines: Pairs, beta: Floats) -> None:
-    """Apply Newton steps with slopes of 32 digits until 16 digits of beta are correct."""
+    """Apply Newton steps with 32-digit slopes, until 16 digits of beta are correct."""
     n = beta.size
     matrix, slope, step, pairs = np.empty((n, n)), np.empty(n), np.empty(n), np.zeros((n, 2))
     last = np.inf
@@ -283,7 +295,10 @@ def _polish(cosines: Pairs, beta: Floats) -> None:
 
 @strict_part
 def _bargained(cosines: Pairs, beta: Floats, exact: Exact) -> bool:
-    """Fill in beta [n]. Return False if beta grows without limit."""
+    """Write the solution beta [n] of the bargaining problem to `beta`.
+
+    Return False if beta grows without limit.
+    """
     n = beta.size
     beta[:] = 1.0
     if n == 2:
@@ -301,7 +316,10 @@ def _bargained(cosines: Pairs, beta: Floats, exact: Exact) -> bool:
 
 @strict_kernel
 def geometric_mean(values: Floats) -> float:
-    """Return the n-th root of a product, without underflow, overflow or loss of digits."""
+    """Return the n-th root of a product of n numbers.
+
+    Overflow, underflow and loss of digits are avoided.
+    """
     mantissa, exponent = 1.0, 0
     for value in values:
         fraction, power = math.frexp(value)
@@ -309,8 +327,8 @@ def geometric_mean(values: Floats) -> float:
         exponent += power
     n = values.size
     whole = exponent // n
-    # The remaining exponent is between 0 and n - 1. The root is taken of the mantissa with this
-    # exponent.
+    # The exponent is split into a multiple of n and a remainder from 0 to n - 1. The root is taken
+    # of the mantissa multiplied by the remaining power of two.
     return math.ldexp(math.ldexp(mantissa, exponent - whole * n) ** (1.0 / n), whole)
 
 
@@ -318,9 +336,10 @@ def geometric_mean(values: Floats) -> float:
 def nash(
     gramians: Floats, rounding_residuals: Floats, present: Flags, unit: float, exact: Exact
 ) -> Solved:
-    """Return weights alpha with G alpha = 1 / alpha, times the geometric mean of the norms.
+    """Return the Nash-MTL weights, multiplied by the geometric mean of the gradient norms.
 
-    Arguments and results are as in `imtl_g`.
+    The weights alpha solve G alpha = 1 / alpha with the Gramian G. `imtl_g` describes the
+    arguments and results.
     """
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
@@ -331,8 +350,8 @@ def nash(
         if n == 0 or not _bargained(cosines, beta, exact):
             continue
         largest = beta.max()
-        # |u|^2 is n. The effect of errors in the cosines is proportional to the largest summand
-        # divided by |u|.
+        # The square |u|^2 equals n. Errors of the cosines affect u in proportion to the largest
+        # summand, divided by |u|.
         ill_conditioned[b] = n > 1 and CAUTION * n * EPSILON * max(largest / np.sqrt(n), 1.0) > unit
         if n > 1 and n <= CANCELLED * largest * largest:
             continue
@@ -347,9 +366,9 @@ def nash(
 def aligned(
     gramians: Floats, rounding_residuals: Floats, present: Flags, unit: float, exact: Exact
 ) -> Solved:
-    """Return the weights sqrt(l_min) V L^-1/2 V^T p with p = 1/K and G = V L V^T.
+    """Return the weights sqrt(l_min) V L^-1/2 V^T p with p = 1/K and the Gramian G = V L V^T.
 
-    Arguments and results are as in `imtl_g`.
+    `imtl_g` describes the arguments and results.
     """
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
@@ -358,8 +377,7 @@ def aligned(
         n = places.size
         if n == 0:
             continue
-        # D C D, the matrix scaled by the norms, has eigenvalues with the same relative errors as
-        # the eigenvalues of C.
+        # The eigenvalues of D C D and of C have equal relative errors.
         pivot = smallest_pivot(cosines[:, :, 0].copy(), n)
         ill_conditioned[b] = n > 1 and CAUTION * n * EPSILON > unit * pivot
         matrix, vectors = _graded(norms, cosines, exact), np.empty((n, n, 2))
@@ -373,7 +391,7 @@ def aligned(
         ones[:, 0] = 1.0
         for i in kept:
             inner = products(vectors[:, i], ones, 0, n, exact)
-            # Skip eigenvectors that are orthogonal to p, because they would contribute only
+            # Skip eigenvectors that are orthogonal to p, because such eigenvectors would add only
             # rounding noise.
             if abs(inner[0]) > OPPOSITE:
                 ratio = quotient(at(matrix[least], least), at(matrix[i], i), exact)

@@ -1,4 +1,4 @@
-"""Projection onto the cone of directions without a conflict (UPGrad, DualProj)."""
+"""Kernels for the projection onto the cone of conflict-free directions (UPGrad, DualProj)."""
 
 import numpy as np
 
@@ -31,9 +31,9 @@ from crossgrad_operators.numba_kernels.polyhedron import (
 
 @strict_device
 def _pair(cosine: float, base: Pairs, z: Pairs) -> None:
-    """Fill in coefficients z [2] of the projection of b [2].
+    """Write the coefficients [2] of the projection of `base` [2] to z.
 
-    At most one coefficient becomes larger than its value in b.
+    At most one coefficient becomes larger than in `base`.
     """
     one, other = base[0, 0], base[1, 0]
     first, second = one + cosine * other, cosine * one + other
@@ -46,7 +46,7 @@ def _pair(cosine: float, base: Pairs, z: Pairs) -> None:
 
 @strict_section
 def _projected(problem: Polyhedron, z: Pairs) -> None:
-    """Fill in coefficients z of the projection of b, or zeros if only rounding noise remains."""
+    """Write the coefficients of the projection to z, or zeros if only rounding noise remains."""
     exact = problem.rounding.exact
     if len(z) == 2 and exact is None:
         _pair(problem.cosines[0, 1, 0], problem.base, z)
@@ -61,13 +61,16 @@ def _projected(problem: Polyhedron, z: Pairs) -> None:
 
 @strict_device
 def _weight(z: Pair, norm: Pair, other: Pair, exact: Exact) -> float:
-    """Return a gradient's weight, from the coefficient z of its direction in units of `norm`."""
+    """Return the weight of a gradient, from the coefficient z of its unit vector.
+
+    The unit of z is `norm`.
+    """
     return product(z, quotient(norm, other, exact), exact)[0]
 
 
 @strict_kernel
 def upgrad(gramians: Floats, rounding_residuals: Floats, present: Flags, exact: Exact) -> Solved:
-    """Return rows [B, K, K]: each gradient, divided by K, projected onto the conflict-free cone."""
+    """Return rows [B, K, K]: each gradient / K, projected onto the conflict-free cone."""
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views, views)), np.zeros(blocks, np.bool_)
     problem = polyhedron(views, exact)
@@ -90,7 +93,7 @@ def upgrad(gramians: Floats, rounding_residuals: Floats, present: Flags, exact: 
 
 @strict_kernel
 def dualproj(gramians: Floats, rounding_residuals: Floats, present: Flags, exact: Exact) -> Solved:
-    """Return weights [B, K] of the mean gradient projected onto the conflict-free cone."""
+    """Return weights [B, K] of the mean gradient, projected onto the conflict-free cone."""
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
     problem = polyhedron(views, exact)

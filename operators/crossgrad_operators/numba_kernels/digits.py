@@ -1,8 +1,8 @@
-"""Arithmetic with one or two float64 numbers: the same algorithms with 16 and with 32 digits.
+"""Arithmetic with one or two float64 numbers, so that algorithms can use 16 or 32 digits.
 
-A number is a pair (high, low). `exact` is True for 32 digits and None for 16 digits. With 16
-digits, only the high part is used. None and True have different types, so Numba compiles the two
-cases separately.
+A number is a pair (high, low) of float64 numbers. `exact` is True for 32 digits and None for 16
+digits. With 16 digits, the low part is always 0. None and True have different types in Numba. Numba
+therefore compiles a separate kernel for each of the two values.
 """
 
 from typing import Final, Literal
@@ -23,14 +23,14 @@ from crossgrad_core.numerics.jit import strict_device, strict_part
 
 Pair = tuple[float, float]
 Exact = Literal[True] | None
-#: Arrays [n, 2] or [n, n, 2]. The last dimension holds the two parts of a number.
+#: Arrays [n, 2] or [n, n, 2]. The last dimension contains the high and the low part of each number.
 Pairs = NDArray[np.float64]
 ONE: Final = (1.0, 0.0)
 
 
 @strict_device
 def plus(a: Pair, b: Pair, exact: Exact) -> Pair:
-    """Return the sum."""
+    """Return a + b."""
     if exact is None:
         return a[0] + b[0], 0.0
     return add(a[0], a[1], b[0], b[1])
@@ -38,7 +38,7 @@ def plus(a: Pair, b: Pair, exact: Exact) -> Pair:
 
 @strict_device
 def minus(a: Pair, b: Pair, exact: Exact) -> Pair:
-    """Return the difference."""
+    """Return a - b."""
     if exact is None:
         return a[0] - b[0], 0.0
     return add(a[0], a[1], -b[0], -b[1])
@@ -46,7 +46,7 @@ def minus(a: Pair, b: Pair, exact: Exact) -> Pair:
 
 @strict_device
 def product(a: Pair, b: Pair, exact: Exact) -> Pair:
-    """Return the product."""
+    """Return a times b."""
     if exact is None:
         return a[0] * b[0], 0.0
     return multiply(a[0], a[1], b[0], b[1])
@@ -54,7 +54,7 @@ def product(a: Pair, b: Pair, exact: Exact) -> Pair:
 
 @strict_device
 def quotient(a: Pair, b: Pair, exact: Exact) -> Pair:
-    """Return the quotient."""
+    """Return a divided by b."""
     if exact is None:
         return a[0] / b[0], 0.0
     return divide(a[0], a[1], b[0], b[1])
@@ -62,7 +62,7 @@ def quotient(a: Pair, b: Pair, exact: Exact) -> Pair:
 
 @strict_device
 def root(a: Pair, exact: Exact) -> Pair:
-    """Return the square root, or 0 for a negative number."""
+    """Return the square root of a, or 0 if a is negative."""
     if exact is None:
         return np.sqrt(max(a[0], 0.0)), 0.0
     return square_root(a[0], a[1])
@@ -70,7 +70,7 @@ def root(a: Pair, exact: Exact) -> Pair:
 
 @strict_part
 def products(a: Pairs, b: Pairs, first: int, last: int, exact: Exact) -> Pair:
-    """Return the sum of a_i b_i, with i from `first` to `last` - 1."""
+    """Return the sum of a_i b_i for i from `first` to `last` - 1."""
     high = low = 0.0
     if exact is None:
         for i in range(first, last):
@@ -111,7 +111,7 @@ def copy(values: Pairs, to: Pairs) -> None:
 
 @strict_device
 def longest_of(norms: Pairs) -> tuple[Pair, float]:
-    """Return the largest of non-negative numbers, and the count of numbers above zero."""
+    """Return the largest of non-negative numbers, and how many of the numbers are above zero."""
     longest, count = 0, 0.0
     for k in range(len(norms)):
         if norms[k, 0] > norms[longest, 0]:

@@ -1,4 +1,4 @@
-"""Gramians as norms and cosines with 16 or 32 digits, and the limit for opposite directions."""
+"""Convert Gramians to norms and cosines with 16 or 32 digits, and detect opposite directions."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from crossgrad_operators.numba_kernels.polyhedron import Polyhedron, share_left,
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-#: The weights, and True for each block whose weights may change with more digits.
+#: The weights, and True for each block whose weights may change if more digits are used.
 Solved = tuple[Floats, Flags]
 
 
@@ -30,18 +30,20 @@ Solved = tuple[Floats, Flags]
 def directions(
     gramian: Floats, remainder: Floats, present: Flags, norms: Pairs, cosines: Pairs, exact: Exact
 ) -> int:
-    """Fill in norms [K] and cosines [K, K]; they are zero for views that are not present.
+    """Write the norms [K] and the cosines [K, K] of the gradients.
+
+    The norms and cosines of views without a gradient are zero.
 
     Args:
-        gramian: [K, K].
-        remainder: [K, K] rounding residual of the Gramian, unused for 16 digits.
-        present: [K].
-        norms: [K] numbers.
-        cosines: [K, K] numbers.
-        exact: True for 32 digits, None for 16.
+        gramian: [K, K] Gramian.
+        remainder: [K, K] rounding residuals of the Gramian; unused with 16 digits.
+        present: [K] True for views that have a gradient.
+        norms: [K] output.
+        cosines: [K, K] output.
+        exact: True for 32 digits, None for 16 digits.
 
     Returns:
-        The number of views that are present.
+        The number of views that have a gradient.
     """
     count = 0
     clear(norms)
@@ -73,7 +75,7 @@ def limited(cosine: Pair) -> Pair:
 
 @strict_device
 def form(v: Pairs, cosines: Pairs, exact: Exact) -> Pair:
-    """Return the square of the sum of v_k times the k-th direction."""
+    """Return the squared length of the sum of v_k times the k-th unit gradient."""
     total = 0.0, 0.0
     for i in range(len(v)):
         if v[i, 0] != 0.0:
@@ -84,14 +86,14 @@ def form(v: Pairs, cosines: Pairs, exact: Exact) -> Pair:
 
 @strict_device
 def cancels(v: Pairs, cosines: Pairs, exact: Exact) -> bool:
-    """Return True if the sum of v_k times the k-th direction is only rounding noise."""
+    """Return True if the sum of v_k times the k-th unit gradient is only rounding noise."""
     longest = np.abs(v[:, 0]).max()
     return form(v, cosines, exact)[0] <= CANCELLED * longest * longest
 
 
 @strict_device
 def present_in(problem: Polyhedron) -> int:
-    """Return the number of directions that are present."""
+    """Return the number of views that have a gradient."""
     count = 0
     for k in range(problem.active.size):
         if problem.cosines[k, k, 0] > 0.0:
@@ -101,10 +103,12 @@ def present_in(problem: Polyhedron) -> int:
 
 @strict_device
 def what_is_left(problem: Polyhedron, x: Pairs) -> float:
-    """Return a factor for coefficients x: 0 if opposite directions leave only rounding noise.
+    """Return a factor for the coefficients x.
 
-    Two directions are opposite if 1 + cos is at most 1e-12. `share_left` describes the rule for
-    more directions.
+    The factor is 0 if only rounding noise of opposite directions remains.
+
+    Two directions are opposite if 1 + cos is at most 1e-12. `share_left` contains the rule for more
+    than two directions.
     """
     if present_in(problem) > 2:
         return share_left(problem, x)

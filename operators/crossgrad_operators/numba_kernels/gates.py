@@ -1,4 +1,4 @@
-"""Running statistics for operators that use earlier steps."""
+"""Kernels for operators that use statistics of earlier steps."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from crossgrad_operators.numba_kernels.normal import (
     Indices,
 )
 
-#: A norm has reached its target if their difference is at most this share of the mean norm.
+#: A gradient norm has reached its target if the difference is at most this share of the mean norm.
 MET = 1e-9
 
 
@@ -20,16 +20,19 @@ MET = 1e-9
 def confident(
     moments: Floats, gramians: Floats, present: Flags, beta: float, score: float, warmup: int
 ) -> Flags:
-    """Return the pairs [B, K, K] that have probably been in conflict, and update `moments`.
+    """Return True for pairs [B, K, K] that have probably conflicted for some time.
+
+    Update `moments`.
 
     Args:
-        moments: [B, 3, K, K] raw exponential averages of the cosine and its square, and the number
-            of updates, changed in place. Pairs with a zero product are not counted.
-        gramians: [B, K, K].
-        present: [B, K].
-        beta: Decay of the averages.
-        score: Value of -mean / sqrt(variance / n_eff + 1e-12) above which a pair conflicts.
-        warmup: Number of updates of a pair before it may conflict.
+        moments: [B, 3, K, K] exponential averages of the cosine and of its square, without bias
+            correction, and number of updates. Changed in place. Pairs whose dot product is zero are
+            not updated.
+        gramians: [B, K, K] Gramians.
+        present: [B, K] True for views that have a gradient.
+        beta: Decay rate of the averages.
+        score: A pair conflicts if -mean / sqrt(variance / n_eff + 1e-12) is at least this value.
+        warmup: Number of updates after which a pair may be projected.
     """
     blocks, views, _ = gramians.shape
     gates = np.zeros((blocks, views, views), np.bool_)
@@ -56,7 +59,7 @@ def confident(
 
 @strict_device
 def _scale(logs: Floats, active: Flags) -> None:
-    """Shift log weights so that the sum of the active weights equals their number."""
+    """Shift log weights such that the active weights add up to the number of active groups."""
     largest = -np.inf
     count = 0
     for s in range(logs.size):
@@ -75,7 +78,10 @@ def _scale(logs: Floats, active: Flags) -> None:
 
 @strict_device
 def _group_lengths(gramian: Floats, group: Indices, lengths: Floats) -> None:
-    """Fill in lengths [S] of the sums over each group; 0 for sums that are only rounding noise."""
+    """Write the length of each group's summed gradient to `lengths` [S].
+
+    A length that is only rounding noise becomes 0.
+    """
     views = group.size
     longest = np.zeros(lengths.size)
     lengths[:] = 0.0
@@ -92,15 +98,15 @@ def _group_lengths(gramian: Floats, group: Indices, lengths: Floats) -> None:
 def follow_losses(
     logs: Floats, gramians: Floats, group: Indices, rates: Floats, alpha: float, lr: float
 ) -> Floats:
-    """Return GradNorm weights [B, K] of this step, and update `logs` for the next step.
+    """Return the GradNorm weights [B, K] of this step, and update `logs` for the next step.
 
     Args:
-        logs: [B, S] log weights, changed in place.
-        gramians: [B, K, K].
-        group: [K] group index of each view, below S.
-        rates: [S] relative losses.
-        alpha: Exponent of the rates.
-        lr: Step of a log weight.
+        logs: [B, S] logarithms of the weights, changed in place.
+        gramians: [B, K, K] Gramians.
+        group: [K] number of the group of each view, below S.
+        rates: [S] relative loss of each group.
+        alpha: Exponent of the relative losses.
+        lr: Amount by which a logarithm changes in each step.
     """
     blocks, views, _ = gramians.shape
     groups = rates.size

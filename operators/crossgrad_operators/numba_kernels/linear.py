@@ -1,4 +1,4 @@
-"""Linear algebra of small matrices, accurate for graded matrices."""
+"""Linear algebra for small matrices, accurate also for diagonal elements of very different size."""
 
 import numpy as np
 
@@ -19,30 +19,34 @@ from crossgrad_operators.numba_kernels.digits import (
 )
 from crossgrad_operators.numba_kernels.normal import Floats, Indices
 
-#: Smallest pivot of a Cholesky factor of cosines. Smaller pivots are rounding noise of a singular
-#: matrix. With this minimum, the null vector, which callers look for, dominates the solution.
+#: Smallest allowed pivot in the Cholesky factorization of a cosine matrix. Smaller pivots are
+#: rounding noise of a singular matrix. With this minimum, the solution is dominated by the null
+#: vector, which callers need.
 PIVOT = 1e-15
 
-#: Maximum number of Jacobi sweeps. For 16 rows, six sweeps are enough, or eight sweeps with 32
-#: digits.
+#: Maximum number of Jacobi sweeps over the matrix. For 16 rows, six sweeps are enough with 16
+#: digits, and eight sweeps with 32 digits.
 SWEEPS = 30
-#: With 32 digits, off-diagonal elements count as zero up to this share of the diagonal elements.
+#: With 32 digits, an off-diagonal element a_ij counts as zero if its magnitude is at most this
+#: share of sqrt(a_ii a_jj).
 NEGLIGIBLE = 1e-31
-#: Elements also count as zero up to this share of the largest element. The square of this share is
-#: not zero in float64.
+#: An element also counts as zero if its magnitude is at most this share of the largest element. The
+#: share is so large that its square does not underflow in float64.
 VANISHING = 1e-140
 
 
 @strict_kernel
 def solve(matrix: Floats, chosen: Indices, count: int, right: Floats, out: Floats) -> None:
-    """Solve M_SS x = r_S by Cholesky, for positive semi-definite M with unit diagonal.
+    """Solve M_SS x = r_S by Cholesky factorization, for a subset S of rows.
+
+    M is positive semi-definite with ones on the diagonal.
 
     Args:
-        matrix: [K, K].
-        chosen: [K] the first `count` entries are the members of S.
-        count: Size of S.
-        right: [K] right-hand side, read at the members of S.
-        out: [K] solution, written at the members of S.
+        matrix: [K, K] matrix M.
+        chosen: [K] row numbers; the first `count` entries form S.
+        count: Number of rows in S.
+        right: [K] right-hand side r, read at the rows in S.
+        out: [K] output x, written at the rows in S.
     """
     lower = np.zeros((count, count))
     for i in range(count):
@@ -71,16 +75,16 @@ def solve(matrix: Floats, chosen: Indices, count: int, right: Floats, out: Float
 
 @strict_kernel
 def solve_shifted(matrix: Floats, right: Floats, out: Floats) -> None:
-    """Solve (1 + M) x = r for positive semi-definite M by Cholesky.
+    """Solve (1 + M) x = r by Cholesky factorization, for a positive semi-definite matrix M.
 
-    The pivots of 1 + M are at least 1. If rounding makes a computed pivot smaller, M is so large
-    that the summand 1 does not matter. In this case x is still finite and, because the factor is
-    regular, not an ascent direction.
+    The pivots of 1 + M are at least 1. If rounding makes a pivot smaller, M is so large that the
+    summand 1 does not matter. Such a pivot is set to 1. x is still finite and, because the factor
+    is regular, a descent direction.
 
     Args:
-        matrix: [n, n] M.
-        right: [n] right-hand side.
-        out: [n] solution.
+        matrix: [n, n] matrix M.
+        right: [n] right-hand side r.
+        out: [n] output x.
     """
     n = right.size
     lower = np.zeros((n, n))
@@ -106,10 +110,10 @@ def solve_shifted(matrix: Floats, right: Floats, out: Floats) -> None:
 
 @strict_kernel
 def smallest_pivot(cosines: Floats, count: int) -> float:
-    """Return the last pivot, at least 0, of a Cholesky factorization that pivots by size.
+    """Return the last pivot of a Cholesky factorization with pivoting; the result is at least 0.
 
-    The pivot is an upper bound of the smallest eigenvalue of the first `count` rows, and rarely
-    more than `count` times as large.
+    The pivot is an upper bound of the smallest eigenvalue of the first `count` rows and columns.
+    The pivot is rarely more than `count` times as large as this eigenvalue.
     """
     rest = cosines[:count, :count].copy()
     pivot = 1.0
@@ -135,7 +139,7 @@ def smallest_pivot(cosines: Floats, count: int) -> float:
 def _rotation(one: Pair, other: Pair, between: Pair, exact: Exact) -> tuple[Pair, Pair, Pair]:
     """Return tangent, cosine and sine of the rotation that clears an off-diagonal element."""
     theta = quotient(minus(other, one, exact), product((2.0, 0.0), between, exact), exact)
-    # Above this limit, the square of theta overflows, or adding 1 to it has no effect.
+    # If theta is above this limit, theta^2 overflows, or adding 1 to theta^2 has no effect.
     far = 1e150 if exact is None else 1e17
     if abs(theta[0]) > far:
         t = quotient((0.5, 0.0), theta, exact)
@@ -150,7 +154,10 @@ def _rotation(one: Pair, other: Pair, between: Pair, exact: Exact) -> tuple[Pair
 
 @strict_device
 def _turn(row: Pairs, p: int, q: int, cosine: Pair, sine: Pair, exact: Exact) -> None:
-    """Rotate the numbers a and b at p and q of a row: c a - s b and s a + c b."""
+    """Replace the numbers a and b at p and q of a row by c a - s b and s a + c b.
+
+    Here c is `cosine` and s is `sine`.
+    """
     a, b = at(row, p), at(row, q)
     put(row, p, minus(product(cosine, a, exact), product(sine, b, exact), exact))
     put(row, q, plus(product(sine, a, exact), product(cosine, b, exact), exact))
@@ -158,7 +165,10 @@ def _turn(row: Pairs, p: int, q: int, cosine: Pair, sine: Pair, exact: Exact) ->
 
 @strict_part
 def _rotate(matrix: Pairs, vectors: Pairs, p: int, q: int, exact: Exact) -> None:
-    """Apply a Jacobi rotation that clears the element (p, q) to a matrix and its eigenvectors."""
+    """Apply a Jacobi rotation that sets the element (p, q) of a matrix to zero.
+
+    Update the eigenvectors.
+    """
     between = at(matrix[p], q)
     one, other = at(matrix[p], p), at(matrix[q], q)
     t, cosine, sine = _rotation(one, other, between, exact)
@@ -177,16 +187,18 @@ def _rotate(matrix: Pairs, vectors: Pairs, p: int, q: int, exact: Exact) -> None
 
 @strict_kernel
 def eigen(matrix: Pairs, vectors: Pairs, exact: Exact) -> Floats:
-    """Return the eigenvalues [n] of a positive semi-definite matrix; they are also on its diagonal.
+    """Return the eigenvalues [n] of a positive semi-definite matrix.
 
-    The method is Jacobi's with the stopping rule |a_ij| <= eps sqrt(a_ii a_jj). Small eigenvalues
-    of a matrix D C D with a well-conditioned C are then relatively accurate for any diagonal D
-    (Demmel and Veselic 1992).
+    The eigenvalues are also on the diagonal of `matrix`.
+
+    The function uses Jacobi's method. The method stops when |a_ij| <= eps sqrt(a_ii a_jj) for all
+    elements a_ij. With this rule, small eigenvalues of a matrix D C D also have small relative
+    errors, for any diagonal D and a well-conditioned C (Demmel and Veselic 1992).
 
     Args:
-        matrix: [n, n] numbers, overwritten.
-        vectors: [n, n] numbers, the eigenvectors as columns.
-        exact: True for 32 digits, None for 16.
+        matrix: [n, n] matrix, overwritten.
+        vectors: [n, n] output, the eigenvectors as columns.
+        exact: True for 32 digits, None for 16 digits.
     """
     n = len(matrix)
     vectors[:] = 0.0
@@ -216,13 +228,13 @@ def eigen(matrix: Pairs, vectors: Pairs, exact: Exact) -> Floats:
 def lost_between(
     matrices: Floats, gramians: Floats, rounding_residuals: Floats, rounded: Floats
 ) -> Floats:
-    """Return the rounding residuals [B, R, R] of M Gram M^T: its exact value minus `rounded`.
+    """Return the rounding residuals [B, R, R] of M G M^T: the exact value minus `rounded`.
 
     Args:
-        matrices: [B, R, K] M.
-        gramians: [B, K, K].
+        matrices: [B, R, K] matrices M.
+        gramians: [B, K, K] Gramians G.
         rounding_residuals: [B, K, K] rounding residuals of the Gramians.
-        rounded: [B, R, R] rounded value of M Gram M^T.
+        rounded: [B, R, R] rounded values of M G M^T.
     """
     blocks, rows, views = matrices.shape
     result = np.empty(rounded.shape)

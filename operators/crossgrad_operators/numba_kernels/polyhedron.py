@@ -1,15 +1,19 @@
-"""The point of a polyhedron {x: x.e_k >= h_k} nearest to a given point, from cosines alone.
+"""Find the point of a polyhedron {x: x.e_k >= h_k} nearest to a given point.
 
-The nearest point to sum b_k e_k is sum (b_k + y_k) e_k with y >= 0, where a multiplier y_k is
-positive only if x.e_k = h_k. MGDA, CAGrad, UPGrad and DualProj all need such points. If the e_k are
-linearly dependent, the multipliers are not unique, but the point is unique.
+Only the cosines of the e_k are needed.
 
-The matrix of cosines is known only up to rounding, so its smallest eigenvalues are unknown.
-Therefore a ridge is added to the diagonal of the matrix, which makes the matrix definite. The ridge
-bounds the multipliers and makes them continuous functions of the cosines. If the effect of the
-ridge matters, the step is repeated from its own result (proximal point iteration). At the end, the
-component along an eigenvector with eigenvalue l is too small only by the share (ridge / (l +
-ridge))^ROUNDS. Directions that are far from linearly dependent need no second round.
+For the given point sum b_k e_k, the nearest point is sum (b_k + y_k) e_k with y >= 0. A multiplier
+y_k is positive only if x.e_k = h_k. MGDA, CAGrad, UPGrad and DualProj all need a nearest point of a
+polyhedron. If the e_k are linearly dependent, the nearest point is unique, but the multipliers are
+not.
+
+The cosines contain rounding errors, so the smallest eigenvalues of the cosine matrix are unknown. A
+small number (the ridge) is therefore added to the diagonal, so that the matrix becomes positive
+definite. The ridge keeps the multipliers bounded, and makes the multipliers continuous functions of
+the cosines. If the ridge affects the result visibly, the solution is repeated, starting from the
+previous solution (proximal point iteration). After these rounds, the component along an eigenvector
+with eigenvalue l is too small only by the share (ridge / (l + ridge))^ROUNDS. If the directions are
+not nearly dependent, one round is enough.
 """
 
 from typing import NamedTuple
@@ -37,27 +41,29 @@ from crossgrad_operators.numba_kernels.digits import (
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.int64]
 
-#: Maximum number of proximal steps. Each step starts from the previous result.
+#: Maximum number of rounds of the proximal point iteration. Each round starts from the solution of
+#: the previous round.
 ROUNDS = 3
-#: If a pivot (the square of a sine) is at most this value, 16 digits may be inaccurate.
+#: If a pivot (the square of a sine) is at most this value, a result with 16 digits may be
+#: inaccurate.
 ILL_CONDITIONED = 1e-6
-#: Maximum number of changes of the active set, per view and round. In observed runs, at most a
-#: sixth of this number was needed.
+#: Maximum number of changes of the active set, for each view and round. Observed problems needed at
+#: most one sixth of this number.
 CHANGES = 12
 
 
 class Rounding(NamedTuple):
-    """Bounds that follow from the number of digits of the cosines.
+    """Limits that depend on the number of digits of the cosines.
 
     Attributes:
-        exact: True for 32 digits, None for 16.
-        ridge: Value added to the diagonal of the cosines. The ridge is larger than the rounding
-            error of a zero eigenvalue (ten times K units, for long sums), and too small to be
-            visible in gradients with half the digits.
-        slack: A constraint is violated if its violation exceeds this share of its terms.
-        shown: The ridge is corrected if it exceeds this share of a pivot.
-        noise: Rounding error of |sum x_k e_k|^2, as a share of sum x_k^2. Gradients with half the
-            digits that were meant to be opposite differ by the same amount.
+        exact: True for 32 digits, None for 16 digits.
+        ridge: Number that is added to the diagonal of the cosine matrix. The ridge exceeds the
+            rounding error of a zero eigenvalue, also for long sums. The ridge is still too small to
+            affect gradients that have half as many digits.
+        slack: A constraint counts as violated if the violation exceeds this share of its terms.
+        shown: The effect of the ridge is corrected if the ridge exceeds this share of a pivot.
+        noise: Rounding error of |sum x_k e_k|^2, relative to sum x_k^2. Opposite gradients with
+            half as many digits can differ by this amount.
     """
 
     exact: Exact
@@ -68,26 +74,29 @@ class Rounding(NamedTuple):
 
 
 class Polyhedron(NamedTuple):
-    """A problem, its current solution, and working memory. Numbers are pairs.
+    """A problem, its present solution, and working memory.
+
+    Each number is a pair of a high and a low part.
 
     Attributes:
-        cosines: [K, K], with zeros in rows and columns of views without a gradient.
-        base: [K] b.
-        heights: [K] h.
-        y: [K] multipliers.
-        centre: [K] multipliers towards which the ridge pulls.
-        active: [K] True if a multiplier may be positive.
-        barred: [K] True if rounding prevents a constraint from becoming active.
-        chosen: [K] indices of the active constraints, at the front.
-        point: [K] b + y.
-        gradient: [K] C (b + y) - h + ridge (y - centre). The gradient is the slack if y = centre.
-        factor: [K, K] Cholesky factor L of the active cosines with their ridge, and L^T above the
-            diagonal.
+        cosines: [K, K] cosines C. Rows and columns of views without a gradient are zero.
+        base: [K] coefficients b of the given point.
+        heights: [K] right-hand sides h of the constraints.
+        y: [K] multipliers y.
+        centre: [K] multipliers of the previous round, towards which the ridge pulls.
+        active: [K] True if a constraint is active, so that its multiplier may be positive.
+        barred: [K] True if a constraint must stay inactive because of rounding.
+        chosen: [K] indices of the active constraints, at the start of the array.
+        point: [K] coefficients b + y of the present point.
+        gradient: [K] gradient C (b + y) - h + ridge (y - centre). If y = centre, the gradient is
+            the slack of the constraints.
+        factor: [K, K] Cholesky factor L of the active cosines with the ridge. The part above the
+            diagonal contains L^T.
         step: [K] change of the multipliers.
         room: [K] working memory of `substitute`.
         ill_conditioned: [1] True if directions are nearly dependent, so that 16 digits may not be
             enough.
-        rounding: Bounds that follow from the number of digits.
+        rounding: Limits that depend on the number of digits.
     """
 
     cosines: Pairs
@@ -135,7 +144,7 @@ def polyhedron(views: int, exact: Exact) -> Polyhedron:
 
 @strict_part
 def _slope(problem: Polyhedron) -> float:
-    """Fill in the gradient, and return the largest coefficient of its terms."""
+    """Compute the gradient, and return the largest coefficient of the present point."""
     views, exact, ridge = problem.active.size, problem.rounding.exact, problem.rounding.ridge
     size = 0.0
     for k in range(views):
@@ -173,7 +182,10 @@ def _factorise(problem: Polyhedron) -> int:
 
 @strict_part
 def substitute(problem: Polyhedron, count: int, right: Pairs, out: Pairs) -> None:
-    """Solve L L^T x = r for the active constraints. r and x are indexed by view."""
+    """Solve L L^T x = r for the active constraints.
+
+    The arrays r (`right`) and x (`out`) are indexed by view.
+    """
     factor, chosen, room = problem.factor, problem.chosen, problem.room
     exact = problem.rounding.exact
     for i in range(count):
@@ -187,7 +199,11 @@ def substitute(problem: Polyhedron, count: int, right: Pairs, out: Pairs) -> Non
 
 @strict_device
 def _first_zero(problem: Polyhedron, count: int) -> tuple[float, int]:
-    """Return the share of the step at which a multiplier becomes zero, and its index (or 1, -1)."""
+    """Return the share of the step after which a multiplier becomes zero.
+
+    The second result is the number of the constraint to which this multiplier belongs. If no
+    multiplier becomes zero, return (1, -1).
+    """
     share, leaving = 1.0, -1
     for i in range(count):
         k = problem.chosen[i]
@@ -201,10 +217,10 @@ def _first_zero(problem: Polyhedron, count: int) -> tuple[float, int]:
 
 @strict_part
 def _settle(problem: Polyhedron, entered: int) -> int:
-    """Move to the minimum of the active face, and drop constraints with a zero multiplier.
+    """Minimize over the active constraints, and remove constraints whose multipliers become zero.
 
     Returns:
-        The number of active constraints in the last factor.
+        The number of active constraints in the last factorization.
     """
     exact = problem.rounding.exact
     while True:
@@ -235,7 +251,7 @@ def _unbar(problem: Polyhedron) -> None:
 
 @strict_device
 def forget(problem: Polyhedron) -> None:
-    """Reset the multipliers and the active set."""
+    """Reset all multipliers to zero and all constraints to inactive."""
     clear(problem.y)
     for k in range(problem.active.size):
         problem.active[k] = False
@@ -243,12 +259,13 @@ def forget(problem: Polyhedron) -> None:
 
 @strict_part
 def approach(problem: Polyhedron) -> int:
-    """Improve the multipliers of the nearest point while the ridge pulls towards `centre`.
+    """Find the multipliers of the nearest point while the ridge pulls towards `centre`.
 
-    The method is the algorithm of Lawson and Hanson.
+    The function uses the active-set method of Lawson and Hanson.
 
     Returns:
-        The number of active constraints, whose factor `substitute` can use.
+        The number of active constraints. `substitute` can use the factorization of the active
+        constraints.
     """
     views, share = problem.active.size, problem.rounding.slack
     _unbar(problem)
@@ -273,7 +290,9 @@ def approach(problem: Polyhedron) -> int:
 
 @strict_device
 def is_settled(problem: Polyhedron) -> bool:
-    """Return True if the ridge has no visible effect: active directions are far from dependent.
+    """Return True if the ridge has no visible effect.
+
+    The ridge has no visible effect if the active directions are not nearly dependent.
 
     The function also sets `ill_conditioned` if the directions require more digits.
     """
@@ -290,7 +309,7 @@ def is_settled(problem: Polyhedron) -> bool:
 
 @strict_part
 def project(problem: Polyhedron) -> None:
-    """Fill in the multipliers of the nearest point."""
+    """Compute the multipliers of the nearest point."""
     forget(problem)
     for _ in range(ROUNDS):
         copy(problem.y, problem.centre)
@@ -301,7 +320,7 @@ def project(problem: Polyhedron) -> None:
 
 @strict_part
 def square(problem: Polyhedron, x: Pairs) -> Pair:
-    """Return |sum x_k e_k|^2."""
+    """Return the squared length |sum x_k e_k|^2."""
     views, exact = problem.active.size, problem.rounding.exact
     total = (0.0, 0.0)
     for k in range(views):
@@ -312,9 +331,12 @@ def square(problem: Polyhedron, x: Pairs) -> Pair:
 
 @strict_part
 def share_left(problem: Polyhedron, x: Pairs) -> float:
-    """Return a factor for coefficients x: 0 if their sum is only rounding noise.
+    """Return a factor for coefficients x.
 
-    Above the noise, the factor grows continuously. The factor reaches 1 at twice the squared noise.
+    The factor is 0 if the sum of the directions, weighted by x, is only rounding noise.
+
+    Above the noise, the factor increases continuously. The factor reaches 1 when the squared length
+    is twice the noise.
     """
     noise = problem.rounding.noise * products(x, x, 0, problem.active.size, None)[0]
     if noise == 0.0:

@@ -1,6 +1,8 @@
-"""Pairwise projections: each gradient is changed by its conflicts with each other gradient in turn.
+"""Kernels for pairwise projection.
 
-A vector v is a sum of unit gradients. The coefficients of the sum are numbers of 16 or 32 digits.
+Each gradient is changed by its conflicts with the other gradients, in turn.
+
+A vector v is stored as a sum of unit gradients. The coefficients of this sum have 16 or 32 digits.
 """
 
 import numpy as np
@@ -35,14 +37,14 @@ from crossgrad_operators.numba_kernels.normal import (
 
 @strict_device
 def _start(v: Pairs, i: int) -> None:
-    """Set v to the direction of g_i."""
+    """Set v to the unit gradient of view i."""
     clear(v)
     v[i, 0] = 1.0
 
 
 @strict_device
 def _as_row(v: Pairs, norms: Pairs, i: int, row: Floats, exact: Exact) -> None:
-    """Convert coefficients of unit vectors, in units of |g_i|, to coefficients of gradients."""
+    """Convert coefficients of unit gradients, in units of |g_i|, to coefficients of the g_k."""
     for k in range(len(v)):
         if v[k, 0] != 0.0:
             ratio = quotient(at(norms, i), at(norms, k), exact)
@@ -51,7 +53,10 @@ def _as_row(v: Pairs, norms: Pairs, i: int, row: Floats, exact: Exact) -> None:
 
 @strict_device
 def _remaining(v: Pairs, cosines: Pairs, exact: Exact) -> Pair:
-    """Return the length of a projected vector, which is set to zero if it is rounding noise."""
+    """Return the length of a projected vector.
+
+    A vector that is only rounding noise is set to zero.
+    """
     square, longest = form(v, cosines, exact), np.abs(v[:, 0]).max()
     if square[0] <= CANCELLED * longest * longest:
         clear(v)
@@ -61,13 +66,13 @@ def _remaining(v: Pairs, cosines: Pairs, exact: Exact) -> Pair:
 
 @strict_device
 def _is_opposite(cosine: Pair, exact: Exact) -> bool:
-    """Return True if 1 + cos is rounding noise."""
+    """Return True if 1 + cos is at most `OPPOSITE`."""
     return plus(ONE, cosine, exact)[0] <= OPPOSITE
 
 
 @strict_device
 def _conflicts(along: Pair, size: Pair, least: Pair, exact: Exact) -> bool:
-    """Return True if the cosine along / size is below -least."""
+    """Return True if the cosine `along` / `size` is below -`least`."""
     return along[0] < 0.0 and plus(along, product(least, size, exact), exact)[0] < 0.0
 
 
@@ -81,24 +86,25 @@ def projected(
     rule: tuple[float, float],
     exact: Exact,
 ) -> Floats:
-    """Return rows v_i [B, K, K]: g_i without (a share of) its components against other gradients.
+    """Return rows v_i [B, K, K]: the gradient g_i after projection against the other gradients.
 
-    For i, for j in order[i]: if cos(v, g_j) < -threshold, v -= strength (v.g_j / |g_j|^2) g_j, with
-    the original g_j. At full strength, a v exactly opposite to g_j becomes exactly zero. A v also
-    becomes zero if its length is below 1.4e-6 of its longest summand.
+    For each i and all j in order[i]: if cos(v, g_j) < -threshold, v -= strength (v.g_j / |g_j|^2)
+    g_j. The original gradient g_j is used. With strength 1, a vector v that is exactly opposite to
+    g_j becomes zero. A vector v also becomes zero if its length is below 1.4e-6 times the length of
+    its longest summand.
 
     Args:
-        gramians: [B, K, K].
-        rounding_residuals: [B, K, K] rounding residuals of the Gramians, unused for 16 digits.
-        present: [B, K].
-        order: [K, K] order of the partners of each i, where i itself is skipped.
+        gramians: [B, K, K] Gramians.
+        rounding_residuals: [B, K, K] rounding residuals of the Gramians; unused with 16 digits.
+        present: [B, K] True for views that have a gradient.
+        order: [K, K] order of the other views for each view i. An entry equal to i is skipped.
         gates: [B, K, K] True if gradient i may be projected against gradient j.
-        rule: Threshold, 0 or more, and strength, from 0 to 1.
-        exact: True for 32 digits, None for 16.
+        rule: Threshold (0 or more) and strength (0 to 1).
+        exact: True for 32 digits, None for 16 digits.
     """
     threshold, strength = rule
-    # With a threshold of 0, the rule is continuous. The sign of a cosine near zero then does not
-    # matter, and no margin is needed.
+    # With a threshold of 0, the rule is continuous. With a continuous rule, the sign of a cosine
+    # near zero hardly matters, so that no margin is needed.
     margin = 0.0 if threshold == 0.0 else OPPOSITE
     least = plus((threshold, 0.0), (margin, 0.0), exact)
     blocks, views, _ = gramians.shape
@@ -130,7 +136,7 @@ def projected(
 
 @strict_device
 def _blur(v: Pairs, size: float, phi: float, t: float) -> float:
-    """Return the growth of the errors of the cosines, for the targets or for the result."""
+    """Return the factor by which errors of the cosines grow in the targets or in the result."""
     share = np.abs(v[:, 0]).max() / size
     steep = 1.0 + abs(t) / np.sqrt((1.0 - t) * (1.0 + t))
     across = max(np.sqrt((1.0 - phi) * (1.0 + phi)), 1e-6)
@@ -139,14 +145,14 @@ def _blur(v: Pairs, size: float, phi: float, t: float) -> float:
 
 @strict_device
 def _sine(cosine: Pair, exact: Exact) -> Pair:
-    """Return the sine of an angle between 0 and pi."""
+    """Return the sine of an angle between 0 and pi, from its cosine."""
     one, other = minus(ONE, cosine, exact), plus(ONE, cosine, exact)
     return root(product(one, other, exact), exact)
 
 
 @strict_device
 def _moved(target: float, phi: Pair, beta: float, exact: Exact) -> float:
-    """Return (1 - beta) t + beta phi, clipped to +-0.999."""
+    """Return (1 - beta) t + beta phi, clipped to +-0.999, for the target t."""
     kept = product(minus(ONE, (beta, 0.0), exact), (target, 0.0), exact)
     moved = plus(kept, product((beta, 0.0), phi, exact), exact)[0]
     return min(max(moved, -0.999), 0.999)
@@ -163,21 +169,22 @@ def aligned_to_targets(
     unit: float,
     exact: Exact,
 ) -> Solved:
-    """Return rows v_i of GradVac, and update `targets`.
+    """Return the rows v_i [B, K, K] of GradVac, and update `targets`.
 
-    For i, for j in order[i]: phi = cos(v, g_j); if phi < t_ij, v gets the multiple of g_j that
-    raises the cosine to t_ij; then t_ij <- (1 - beta) t_ij + beta phi, clipped to +-0.999. A v
-    becomes exactly zero under the same conditions as in `projected`.
+    For each i and all j in order[i]: phi = cos(v, g_j). If phi is below the target t_ij, a multiple
+    of g_j is added to v, so that the cosine becomes t_ij. In any case, the target t_ij becomes (1 -
+    beta) t_ij + beta phi, clipped to +-0.999. A vector v becomes exactly zero under the conditions
+    that `projected` describes.
 
     Args:
-        gramians: [B, K, K].
-        rounding_residuals: The rounding residuals, as in `projected`.
-        present: [B, K].
-        order: [K, K].
-        targets: [B, K, K], changed in place.
-        beta: Weight of the newest cosine.
-        unit: Relative error above which a result of 16 digits is ill-conditioned.
-        exact: True for 32 digits, None for 16.
+        gramians: [B, K, K] Gramians.
+        rounding_residuals: [B, K, K] rounding residuals of the Gramians; unused with 16 digits.
+        present: [B, K] True for views that have a gradient.
+        order: [K, K] order of the other views for each view.
+        targets: [B, K, K] target cosines, changed in place.
+        beta: Weight of the newest cosine in the target.
+        unit: Largest relative error for which a result with 16 digits is accepted.
+        exact: True for 32 digits, None for 16 digits.
 
     Returns:
         [B, K, K] rows, and [B] True if rows or targets are ill-conditioned.

@@ -1,14 +1,15 @@
-"""Minima over convex combinations of the gradients (MGDA, CAGrad).
+"""Kernels for minima over convex combinations of the gradients (MGDA, CAGrad).
 
-Weights w on the simplex are stored as x_k = w_k |g_k| / s, where s is the smallest norm. For any
-ratio of norms, the combination is then sum x_k e_k, which needs only the cosines. The constraint is
-sum_k r_k x_k = 1 with r_k = s / |g_k|. Up to a factor, both methods need the nearest point of a
-polyhedron {x: x.e_k >= level r_k}:
+Weights w with w >= 0 and sum w = 1 are stored as x_k = w_k |g_k| / s, where s is the smallest norm.
+In this form, the combination is sum x_k e_k for unit gradients e_k. In this form, the combination
+depends only on the cosines, for any ratio of norms. The constraint is sum_k r_k x_k = 1 with r_k =
+s / |g_k|. Up to a factor, MGDA and CAGrad both need the nearest point in a polyhedron {x: x.e_k >=
+level r_k}:
 
-- MGDA: at any level, the polyhedron's nearest point to 0 has the direction of the shortest
-  combination.
-- CAGrad: let d be the direction with the largest min_k g_k.d in the ball of radius rho about g_0.
-  Then d is the point nearest to g_0 at the level for which this point has the distance rho.
+- MGDA: for any level, the point nearest to 0 has the direction of the shortest combination.
+- CAGrad: let d be the direction that maximizes min_k g_k.d in the ball with radius rho around g_0.
+  Then d is the point nearest to g_0, at the level for which this point has the distance rho from
+  g_0.
 """
 
 from typing import NamedTuple
@@ -53,23 +54,27 @@ from crossgrad_operators.numba_kernels.polyhedron import (
     substitute,
 )
 
-#: Maximum number of levels that are tried. About five are usual.
+#: Maximum number of levels that the search tries. About five levels are usually enough.
 LEVELS = 60
-#: A level is accepted if the active constraints do not change and its change is small or reversed.
-#: A change is small if it is at most this share of the level. The next rounds correct the remaining
-#: error.
+#: The search ends when the active constraints no longer change and the change of the level is small
+#: or changes its sign. A change is small if its magnitude is at most this share of the level. Later
+#: rounds correct the remaining error.
 CLOSE = 1e-6
-#: If the ridge adds more than this share of rho^2 to the distance, the directions may cancel.
+#: If the ridge adds more than this share of rho^2 to the squared distance, the directions may
+#: cancel each other.
 HELD_BY_RIDGE = 1e-5
 #: Two squared distances count as equal if their relative difference is at most this value.
 TIE = 1e-9
-#: Two gradients are combined only if the square of the sine between them is at least this value.
+#: Two gradients are combined only if the squared sine of their angle is at least this value.
 PIVOT = 1e-15
 
 
 @strict_device
 def _reciprocals(norms: Pairs, present: Flags, r: Pairs, exact: Exact) -> None:
-    """Fill in r_k = s / |g_k|, with zeros for views that are not present."""
+    """Write r_k = s / |g_k| to `r`, where s is the smallest norm.
+
+    Views without a gradient get zeros.
+    """
     shortest = -1
     for k in range(present.size):
         if present[k] and (shortest < 0 or norms[k, 0] < norms[shortest, 0]):
@@ -82,7 +87,7 @@ def _reciprocals(norms: Pairs, present: Flags, r: Pairs, exact: Exact) -> None:
 
 @strict_device
 def _mgda_pair(cosine: float, r: Pairs, x: Pairs) -> None:
-    """Fill in x [2] for the shortest vector among two gradients and their combinations."""
+    """Write x [2] for the shortest vector among two gradients and their convex combinations."""
     one, other = r[0, 0], r[1, 0]
     x[0, 0], x[1, 0] = 1.0 / one, 0.0
     best = x[0, 0] * x[0, 0]
@@ -103,7 +108,11 @@ def _mgda_pair(cosine: float, r: Pairs, x: Pairs) -> None:
 
 @strict_section
 def _shortest(problem: Polyhedron, x: Pairs) -> float:
-    """Fill in x, and return the share of x that is not rounding noise. The heights are r."""
+    """Compute x for the shortest combination.
+
+    Return the share of x that is not rounding noise. The array `problem.heights` must contain the
+    quotients r_k = s / |g_k|.
+    """
     exact, r = problem.rounding.exact, problem.heights
     if len(x) == 2 and exact is None and r[0, 0] > 0.0 and r[1, 0] > 0.0:
         _mgda_pair(problem.cosines[0, 1, 0], r, x)
@@ -117,7 +126,10 @@ def _shortest(problem: Polyhedron, x: Pairs) -> float:
 
 @strict_kernel
 def mgda(gramians: Floats, rounding_residuals: Floats, present: Flags, exact: Exact) -> Solved:
-    """Return weights [B, K] of the shortest convex combination, or zeros if its length is noise."""
+    """Return the weights [B, K] of the shortest convex combination.
+
+    Return zeros if its length is only rounding noise.
+    """
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
     problem = polyhedron(views, exact)
@@ -138,12 +150,12 @@ def mgda(gramians: Floats, rounding_residuals: Floats, present: Flags, exact: Ex
 
 
 class Search(NamedTuple):
-    """The search of CAGrad for the level at which the nearest point to g_0 is at distance rho.
+    """CAGrad's search for the level at which the point nearest to g_0 has the distance rho.
 
     Attributes:
-        q: [K] e_k.g_0.
-        r: [K] s / |g_k|.
-        rho: The square of the distance, and the distance.
+        q: [K] products e_k.g_0 with the unit gradients e_k.
+        r: [K] quotients s / |g_k|, with s the smallest norm.
+        rho: The squared distance, and the distance.
     """
 
     q: Pairs
@@ -153,10 +165,10 @@ class Search(NamedTuple):
 
 @strict_device
 def _limits(search: Search) -> tuple[float, float]:
-    """Return two levels.
+    """Return a lower and an upper limit of the level.
 
-    Below the first level, no constraint is active. At the second level, one constraint is at
-    distance rho.
+    Below the lower limit, no constraint is active. At the upper limit, one constraint alone already
+    has the distance rho.
     """
     low, high = np.inf, np.inf
     for k in range(len(search.r)):
@@ -168,11 +180,13 @@ def _limits(search: Search) -> tuple[float, float]:
 
 @strict_device
 def _change(problem: Polyhedron, count: int, search: Search, level: Pair, ridge: float) -> Pair:
-    """Return the change of level that moves the nearest point on the active face to distance rho.
+    """Return the change of the level after which the nearest point has the distance rho.
 
-    With the slope a = C^-1 r of the multipliers, the squared distance is a quadratic function of
-    the change. The change is infinite if no constraint is active, or if huge multipliers have a
-    rounding error larger than the distance.
+    The active constraints are assumed not to change.
+
+    With the derivative a = C^-1 r of the multipliers, the squared distance is a quadratic function
+    of this change. The change is infinite if no constraint is active. The change is also infinite
+    if the rounding errors of very large multipliers exceed the distance.
     """
     exact, slope = problem.rounding.exact, problem.step
     substitute(problem, count, search.r, slope)
@@ -180,8 +194,8 @@ def _change(problem: Polyhedron, count: int, search: Search, level: Pair, ridge:
     for i in range(count):
         k = problem.chosen[i]
         y, a, r = at(problem.y, k), at(slope, k), at(search.r, k)
-        # On the active face, C y + q - level r + ridge (y - centre) = 0. This equation gives C y
-        # and C a.
+        # For active constraints, C y + q - level r + ridge (y - centre) = 0. The equation gives C
+        # y, and its derivative gives C a.
         pull = minus((ridge * y[0], ridge * y[1]), (ridge * problem.centre[k, 0], 0.0), exact)
         force = minus(product(level, r, exact), plus(at(search.q, k), pull, exact), exact)
         turn = minus(r, (ridge * a[0], ridge * a[1]), exact)
@@ -196,7 +210,10 @@ def _change(problem: Polyhedron, count: int, search: Search, level: Pair, ridge:
 
 @strict_device
 def _is_beyond_reach(problem: Polyhedron, search: Search) -> bool:
-    """Return True if only the ridge bounds the multipliers, so that their sum is rounding noise."""
+    """Return True if only the ridge keeps the multipliers bounded.
+
+    If only the ridge bounds the multipliers, the weighted sum of the directions is rounding noise.
+    """
     total = 0.0
     for k in range(len(search.r)):
         moved = problem.y[k, 0] - problem.centre[k, 0]
@@ -206,7 +223,10 @@ def _is_beyond_reach(problem: Polyhedron, search: Search) -> bool:
 
 @strict_device
 def _repeats(problem: Polyhedron, before: Flags) -> bool:
-    """Return True if the active constraints equal the stored constraints; store the active ones."""
+    """Return True if the active constraints equal the stored constraints.
+
+    After the comparison, store the active constraints.
+    """
     same = True
     for k in range(before.size):
         same &= before[k] == problem.active[k]
@@ -216,10 +236,13 @@ def _repeats(problem: Polyhedron, before: Flags) -> bool:
 
 @strict_section
 def _find_level(problem: Polyhedron, search: Search, level: Pair, ridge: float) -> Pair:
-    """Return the level at which the nearest point is at distance rho, and fill in multipliers.
+    """Return the level at which the nearest point has the distance rho.
 
-    The distance is a convex, increasing function of the level. Its pieces are solved one after
-    another. If a solution leaves the interval that contains the level, the interval is halved.
+    The multipliers of this point are computed, too.
+
+    The distance is a convex and increasing function of the level. The function consists of pieces
+    with different active constraints, which are solved one after another. If a solution is outside
+    the interval that contains the level, the interval is halved instead.
     """
     exact, before = problem.rounding.exact, np.zeros(problem.active.size, np.bool_)
     low, high = _limits(search)
@@ -247,13 +270,13 @@ def _find_level(problem: Polyhedron, search: Search, level: Pair, ridge: float) 
 
 @strict_section
 def _reach(problem: Polyhedron, search: Search) -> None:
-    """Raise the level of all constraints until the nearest point is at distance rho."""
+    """Increase the level of all constraints until the nearest point has the distance rho."""
     forget(problem)
     level = (_limits(search)[1], 0.0)
     for turn in range(ROUNDS):
         copy(problem.y, problem.centre)
-        # In the first round, the ridge counts as a part of the directions, so the directions do not
-        # cancel.
+        # In the first round, the ridge counts as a part of the directions, so that the directions
+        # cannot cancel.
         ridge = problem.rounding.ridge if turn > 0 else 0.0
         level = _find_level(problem, search, level, ridge)
         if is_settled(problem) or share_left(problem, problem.y) == 0.0:
@@ -262,11 +285,11 @@ def _reach(problem: Polyhedron, search: Search) -> None:
 
 @strict_section
 def _defined(problem: Polyhedron, search: Search) -> float:
-    """Return the share of CAGrad's direction that is defined, and leave the multipliers unchanged.
+    """Return the share of CAGrad's direction that is well defined. The multipliers are not changed.
 
-    The direction is undefined if level 0 is within the distance and 0 is a convex combination of
-    the gradients. In this situation no level above 0 can be reached. Many directions are then
-    equally good.
+    The direction is undefined if 0 is a convex combination of the gradients and the point of level
+    0 is within the distance rho. If the direction is undefined, no level above 0 can be reached,
+    and many directions are equally good.
     """
     largest, rho = 0.0, search.rho[0][0]
     for k in range(len(search.r)):
@@ -290,11 +313,14 @@ def _defined(problem: Polyhedron, search: Search) -> float:
 
 @strict_device
 def _cagrad_pair(n1: float, n2: float, cosine: float, c: float) -> tuple[float, float, float]:
-    """Return the weight of g_1 in g_w, |g_w| and |g_0| (g_0 is the mean), for norms 1 = n1 >= n2.
+    """Return three numbers for two gradients with norms 1 = n1 >= n2.
 
-    The objective (a - b) x / 2 + c |g_0| sqrt(D (x - x_0)^2 + h^2) is convex in x. Sums of squares
-    are arranged so that only the cosine itself can cancel. The function returns the weight of the
-    longer gradient, because this weight may be tiny.
+    The three numbers are the weight of g_1 in g_w, |g_w|, and |g_0|. Here g_0 is the mean gradient.
+
+    The objective (a - b) x / 2 + c |g_0| sqrt(D (x - x_0)^2 + h^2) is convex in the weight x of
+    g_1. The numbers a, b, D, x_0 and h do not depend on x. Sums of squares are arranged such that
+    only the cosine itself can cause cancellation. The weight of the longer gradient is returned,
+    because this weight may be very small.
     """
     product = n1 * n2
     gap = (n1 - n2) * (n1 - n2)
@@ -318,7 +344,7 @@ def _cagrad_pair(n1: float, n2: float, cosine: float, c: float) -> tuple[float, 
 
 @strict_part
 def _cagrad_two(norms: Pairs, cosine: float, c: float, result: Floats) -> None:
-    """Fill in the weights [2] of two gradients."""
+    """Write the weights [2] of two gradients to `result`."""
     i, j = (0, 1) if norms[0, 0] >= norms[1, 0] else (1, 0)
     longest = norms[i, 0]
     share, length, mean = _cagrad_pair(1.0, norms[j, 0] / longest, cosine, c)
@@ -330,7 +356,10 @@ def _cagrad_two(norms: Pairs, cosine: float, c: float, result: Floats) -> None:
 
 @strict_device
 def _set_out(problem: Polyhedron, norms: Pairs, q: Pairs, c: float) -> Search:
-    """Return the search from the mean, in units of the longest gradient. The heights are r."""
+    """Return the search that starts at the mean, in units of the longest gradient.
+
+    The array `problem.heights` must contain the quotients r_k = s / |g_k|.
+    """
     exact, views = problem.rounding.exact, len(norms)
     longest, count = longest_of(norms)
     r = np.empty((views, 2))
@@ -347,10 +376,10 @@ def _set_out(problem: Polyhedron, norms: Pairs, q: Pairs, c: float) -> Search:
 
 @strict_section
 def _cagrad_many(problem: Polyhedron, norms: Pairs, q: Pairs, c: float, result: Floats) -> None:
-    """Fill in the weights [K] of at least two gradients. q is working memory.
+    """Write the weights [K] of two or more gradients to `result`. The array q is working memory.
 
-    If the mean or a convex combination of the gradients is zero, the direction is undefined, and
-    the result is zero by convention.
+    If the mean or some convex combination of the gradients is zero, the direction is undefined. If
+    the direction is undefined, the result is zero.
     """
     exact, views = problem.rounding.exact, len(norms)
     search = _set_out(problem, norms, q, c)
@@ -372,7 +401,7 @@ def _cagrad_many(problem: Polyhedron, norms: Pairs, q: Pairs, c: float, result: 
 
 @strict_device
 def _least_cosine(problem: Polyhedron) -> float:
-    """Return the smallest cosine between two views that are present."""
+    """Return the smallest cosine between two views that have a gradient."""
     least, cosines = 1.0, problem.cosines
     for i in range(len(cosines)):
         for j in range(i):
@@ -383,7 +412,10 @@ def _least_cosine(problem: Polyhedron) -> float:
 
 @strict_section
 def _cagrad(problem: Polyhedron, norms: Pairs, q: Pairs, c: float, result: Floats) -> None:
-    """Fill in the weights [K] of one block. The heights are r."""
+    """Write the weights [K] of one block to `result`.
+
+    The array `problem.heights` must contain the quotients r_k = s / |g_k|.
+    """
     views, exact = len(norms), problem.rounding.exact
     _, count = longest_of(norms)
     cosine = _least_cosine(problem)
@@ -402,7 +434,7 @@ def _cagrad(problem: Polyhedron, norms: Pairs, q: Pairs, c: float, result: Float
 def cagrad(
     gramians: Floats, rounding_residuals: Floats, present: Flags, exact: Exact, c: float
 ) -> Solved:
-    """Return weights [B, K] 1/K + c |g_0| w_k / |g_w| of CAGrad's direction, without rescaling."""
+    """Return weights [B, K] of CAGrad's direction, 1/K + c |g_0| w_k / |g_w|, without rescaling."""
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
     problem = polyhedron(views, exact)

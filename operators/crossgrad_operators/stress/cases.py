@@ -1,4 +1,4 @@
-"""Inputs of the suite: K gradients that are periodic, or short enough for exact sums."""
+"""Test inputs for operators: K gradients that are periodic, or short enough for exact sums."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,25 +10,27 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 Rows = NDArray[np.float64]
-#: Number of elements of the largest cases, and number of elements of the largest case that repeats
-#: no elements.
+#: `LARGE`: number of elements of the largest cases. `EXACT`: number of elements of the largest case
+#: that is not periodic.
 LARGE = 10_000_000
 EXACT = 10_000
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """K gradients of P = H + R * Q elements: a head, followed by R copies of a pattern.
+    """K gradients with H + R * Q elements.
 
-    Quantities that are sums over elements, such as Gramians, then have a closed form for any P.
+    A gradient starts with a head of H elements, followed by R copies of a pattern of Q elements.
+
+    A Gramian is a sum over elements. Gramians can therefore be computed exactly even for large R.
 
     Attributes:
-        name: Name in the table.
-        head: [K, H] float64.
-        pattern: [K, Q] float64.
-        copies: R.
-        dtype: Type of the gradients. Head and pattern are rounded to this type.
-        absent: Views that do not touch the block.
+        name: Name of the case in the table.
+        head: [K, H] float64 values of the head.
+        pattern: [K, Q] float64 values of the pattern.
+        copies: Number of copies R.
+        dtype: Type of the gradients. The head and the pattern are rounded to this type.
+        absent: Indices of the views that do not touch the block.
     """
 
     name: str
@@ -50,16 +52,22 @@ class Case:
 
     @cached_property
     def exact_head(self) -> Rows:
-        """[K, H] the head as the operator receives it: rounded, and zero for absent views."""
+        """[K, H] values of the head that the operator receives.
+
+        The values are rounded, and zero for absent views.
+        """
         return self._rounded(self.head)
 
     @cached_property
     def exact_pattern(self) -> Rows:
-        """[K, Q] the pattern as the operator receives it: rounded, and zero for absent views."""
+        """[K, Q] values of the pattern that the operator receives.
+
+        The values are rounded, and zero for absent views.
+        """
         return self._rounded(self.pattern)
 
     def gradients(self) -> list[Tensor | None]:
-        """Return new tensors with the K gradients, or None for absent views."""
+        """Return the K gradients as new tensors; None for absent views."""
         head = torch.from_numpy(self.exact_head).to(self.dtype)
         pattern = torch.from_numpy(self.exact_pattern).to(self.dtype)
         return [
@@ -79,13 +87,16 @@ def short(
     dtype: torch.dtype = torch.float32,
     absent: frozenset[int] = frozenset(),
 ) -> Case:
-    """Return a case without repetition. `rows` is [K, P]."""
+    """Return a case that is not periodic. The argument `rows` is [K, P]."""
     head = np.asarray(rows, np.float64)
     return Case(name, head, np.zeros((len(head), 0)), 0, dtype, absent)
 
 
 def cases(large: int = LARGE, exact: int = EXACT) -> list[Case]:
-    """Return all cases. Periodic cases have up to `large` elements, other cases up to `exact`."""
+    """Return all test cases.
+
+    Periodic cases have up to `large` elements. Other cases have up to `exact` elements.
+    """
     return [
         *_ordinary(exact),
         *_ratios(),
@@ -115,7 +126,7 @@ def _ordinary(exact: int) -> Iterator[Case]:
 
 
 def _ratios() -> Iterator[Case]:
-    """Yield cases with large norm ratios at cosine -1/2."""
+    """Yield cases with a cosine of -1/2 and very different gradient norms."""
     for power in (3, 6, 12, 20, 30):
         yield short(f"ratio 1e{power}", _at_cosine(-0.5, 1.0, 10.0**-power))
     yield short("ratio 1e30 up", _at_cosine(-0.5, 1e-15, 1e15))
@@ -132,7 +143,7 @@ def _at_cosine(cosine: float, first: float, second: float) -> Rows:
 
 
 def _angles() -> Iterator[Case]:
-    """Yield cases with cosines close to -1 and +1; eps is the sine of the angle."""
+    """Yield cases with cosines close to -1 and +1. Here eps is the sine of the angle."""
     for eps in (1e-2, 1e-4, 1e-5):
         yield short(f"cos -1 + {eps**2 / 2:.0e}", [[1.0, 0.0], [-1.0, eps]])
         yield short(f"cos 1 - {eps**2 / 2:.0e}", [[1.0, 0.0], [1.0, eps]])
@@ -192,7 +203,7 @@ def _not_finite() -> Iterator[Case]:
 def _many_views() -> Iterator[Case]:
     for views in (1, 3, 4, 5, 8, 12, 16):
         yield short(f"K = {views}", _rng(20 + views).standard_normal((views, 40)))
-    # The cosines of all pairs are about -0.04, so each view conflicts with all other views.
+    # The cosines of all pairs are about -0.04, so that each view conflicts with all other views.
     rows = _centred(_rng(40).standard_normal((16, 60)))
     yield short("K = 16, all conflict", rows)
     rows = _rng(41).standard_normal((8, 40)) * 10.0 ** np.linspace(0, 12, 8)[:, None]

@@ -1,4 +1,4 @@
-"""`crossgrad stress`: comparison of operators with exact arithmetic on extreme gradients."""
+"""`crossgrad stress`: compare operators with exact arithmetic on extreme gradients."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 #: Default number of elements of the largest gradients.
 LARGE = 10_000_000
-#: Option -> kinds of runs that use it. The kind "" stands for the fixed cases.
+#: Option -> kinds of tests that use this option. An empty kind of test means the fixed test cases.
 _USED: Final[Mapping[str, tuple[str, ...]]] = {
     "--case": ("",),
     "--elements": ("",),
@@ -43,7 +43,7 @@ Types: TypeAlias = "tuple[torch.dtype, ...]"
 
 
 class Precision(StrEnum):
-    """The type of gradients in a search."""
+    """Types of the gradients in a search."""
 
     FLOAT32 = "float32"
     FLOAT64 = "float64"
@@ -51,7 +51,7 @@ class Precision(StrEnum):
 
     @property
     def dtypes(self) -> Types:
-        """The types as torch dtypes."""
+        """The selected types as torch dtypes."""
         import torch
 
         both = {"float32": torch.float32, "float64": torch.float64}
@@ -124,7 +124,7 @@ def stress(given: Options) -> None:
 
 
 def _refuse_idle(given: Options) -> None:
-    """Refuse options that have no effect in the chosen kind of run."""
+    """Raise an error for options that have no effect in the selected kind of test."""
     modes = {"--search": given.search, "--matrices": given.matrices, "--rows": given.rows}
     others = {
         "--case": given.case,
@@ -214,7 +214,7 @@ def _matrices(
 
 
 class _Clock:
-    """Prints the progress of a search at intervals."""
+    """A printer that shows the progress of a search at regular intervals."""
 
     def __init__(self) -> None:
         self._progress = Progress(PAUSE)

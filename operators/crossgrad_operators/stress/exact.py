@@ -1,6 +1,6 @@
-"""Exact Gramians and norms as 50-digit numbers, and linear algebra for small matrices.
+"""Exact Gramians and norms with 50 digits, and linear algebra for small matrices.
 
-The numbers are from mpmath, which is a test dependency.
+The numbers come from mpmath, a package that only tests require.
 """
 
 from collections.abc import Sequence
@@ -15,14 +15,15 @@ from crossgrad_operators.stress.cases import Case, Rows
 Number: TypeAlias = Any
 Matrix: TypeAlias = list[list[Number]]
 DIGITS = 50
-#: Range of the exponents of products of float64 numbers, in binary digits. Sums with this precision
-#: are exact.
+#: Range of the binary exponents of products of float64 numbers. Sums with this number of bits are
+#: exact.
 _RANGE = 4300
 Vector = list[Number]
-#: Pivots below this relative size count as zero. The pivots of exactly singular matrices are about
+#: Pivots below this relative size count as zero. Exactly singular matrices have pivots of about
 #: 1e-50.
 SINGULAR = "1e-35"
-#: Factor for a direction. It is so large that an entry reaches zero before the end of the step.
+#: Length of a step along a null vector. The step is so long that some element reaches zero before
+#: its end.
 FAR = 10**30
 
 
@@ -48,7 +49,7 @@ def number(value: object) -> Number:
 
 
 def exact_gramian(case: Case) -> Matrix:
-    """Return the Gramian [K][K] of a case, with zeros in rows of views that are not finite."""
+    """Return the Gramian [K][K] of a case. Rows of views with non-finite gradients are zero."""
     mpf = require_mpmath().mp.mpf
     views = case.views
     rows = _finite_rows(case)
@@ -61,13 +62,13 @@ def exact_gramian(case: Case) -> Matrix:
 
 
 def finite_views(case: Case) -> list[bool]:
-    """Return for each view [K] whether its gradient is finite."""
+    """Return whether the gradient of each view [K] is finite."""
     both = np.concatenate([case.exact_head, case.exact_pattern], axis=1)
     return [bool(np.isfinite(row).all()) for row in both]
 
 
 def weighted_sum(weights: Sequence[Number], rows: Rows) -> list[Number]:
-    """Return the sum [P] of weights times rows [K, P], without rows of weight 0."""
+    """Return the sum [P] of weights times rows [K, P]. Rows with weight 0 are left out."""
     mp = require_mpmath().mp
     used = [(w, row) for w, row in zip(weights, rows.tolist(), strict=True) if w != 0]
     return [mp.fdot([(w, row[i]) for w, row in used]) for i in range(rows.shape[1])]
@@ -79,7 +80,7 @@ def _finite_rows(case: Case) -> tuple[Rows, Rows]:
 
 
 def _dot(a: Rows, b: Rows) -> Number:
-    """Return the dot product of two float64 vectors, rounded once."""
+    """Return the dot product of two float64 vectors, computed exactly and rounded once."""
     mp = require_mpmath().mp
     with mp.workprec(_RANGE):
         total = mp.fdot(zip(a.tolist(), b.tolist(), strict=True))
@@ -87,27 +88,30 @@ def _dot(a: Rows, b: Rows) -> Number:
 
 
 def dot(a: Sequence[Number], b: Sequence[Number]) -> Number:
-    """Return a.b."""
+    """Return the dot product a.b."""
     return require_mpmath().mp.fdot(zip(a, b, strict=True))
 
 
 def apply(matrix: Matrix, x: Sequence[Number]) -> Vector:
-    """Return M x."""
+    """Return the product of the matrix and the vector x."""
     return [dot(row, x) for row in matrix]
 
 
 def form(matrix: Matrix, x: Sequence[Number]) -> Number:
-    """Return the quadratic form x^T M x."""
+    """Return the quadratic form x^T M x of the matrix M."""
     return dot(x, apply(matrix, x))
 
 
 def solve(matrix: Matrix, support: Sequence[int], right: Sequence[Number]) -> Vector | None:
-    """Return x with (M x)_S = right_S and zero outside the support S, or None if M_SS is singular.
+    """Return x with (M x)_S = right_S and with zeros outside the rows S.
 
-    M is positive semi-definite. The method is Cholesky's, L D L^T = M_SS.
+    Return None if M_SS is singular.
+
+    M is positive semi-definite, and S is `support`. The function uses the Cholesky factorization L
+    D L^T = M_SS.
     """
     mp = require_mpmath().mp
-    # Scale by the diagonal, so that a large ratio of norms does not look singular.
+    # Scale M by its diagonal, so that a large ratio of norms does not make M look singular.
     unit = [mp.sqrt(matrix[i][i]) for i in support]
     lower: list[Vector] = []
     diagonal: Vector = []
@@ -133,12 +137,14 @@ def solve(matrix: Matrix, support: Sequence[int], right: Sequence[Number]) -> Ve
 
 
 def complementary(matrix: Matrix, offset: Sequence[Number]) -> Vector | None:
-    """Return x >= 0 with s = M x + offset >= 0 and x.s = 0, the optimality conditions of a QP.
+    """Return x >= 0 with s = M x + `offset` >= 0 and x.s = 0.
 
-    The algorithm of Lawson and Hanson is used, and each result is checked. The most violated
-    constraint becomes active. If the column of this constraint depends on the active columns, an
-    active constraint is removed first. Therefore M may be singular. None is returned if there is no
-    solution.
+    The conditions are the optimality conditions of a quadratic program.
+
+    The function uses the active-set method of Lawson and Hanson, and checks the result. In each
+    step, the most violated constraint becomes active. If the column of this constraint is a
+    combination of active columns, an active constraint is removed first. M may be singular, because
+    dependent columns are never active together. If no solution exists, the function returns None.
     """
     mp = require_mpmath().mp
     x = [mp.mpf(0)] * len(matrix)
@@ -160,13 +166,16 @@ def complementary(matrix: Matrix, offset: Sequence[Number]) -> Vector | None:
 def _settle(
     matrix: Matrix, offset: Sequence[Number], x: list[Number], active: set[int], entered: int
 ) -> bool:
-    """Solve for the active entries of x, and release entries that reach zero on the way."""
+    """Solve for the active elements of x.
+
+    Remove elements that reach zero on the way from the active set.
+    """
     least = require_mpmath().mp.mpf("1e-300")
     while active:
         target = solve(matrix, sorted(active), [-o for o in offset])
         if target is None:
-            # The new column is a combination of the other columns, so x can move along the null
-            # vector.
+            # x can move along a null vector, because the new column is a combination of the other
+            # active columns.
             rest = sorted(active - {entered})
             along = solve(matrix, rest, [-row[entered] for row in matrix])
             if along is None or all(v >= 0 for v in along):
@@ -187,7 +196,7 @@ def _settle(
 
 
 def pivots(matrix: Matrix) -> Vector:
-    """Return the Cholesky pivots of a positive semi-definite matrix, the largest first."""
+    """Return the Cholesky pivots of a positive semi-definite matrix, in descending order."""
     left = [list(row) for row in matrix]
     positive_pivots = []
     while left:

@@ -1,8 +1,8 @@
-"""Reference implementations (oracles) of all methods in 50 digits, from their formulas.
+"""Reference implementations (oracles) of all operators with 50 digits, written from their formulas.
 
-An oracle receives the exact Gramian of the views with a gradient, and returns their weights. The
-oracles use the thresholds that are part of our definition of a method: exact opposition up to 1 +
-cos = 1e-12, and the eigenvalue floor of Aligned-MTL.
+An oracle receives the exact Gramian of the views that have a gradient, and returns the weights of
+these views. Oracles include two thresholds that crossgrad defines: the limit 1 + cos = 1e-12 for
+opposite directions, and the eigenvalue limit of Aligned-MTL.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -23,8 +23,8 @@ from crossgrad_operators.stress.exact import (
 
 #: Two directions count as exactly opposite if 1 + cos is at most this value.
 OPPOSITE = "1e-12"
-#: Two directions count as unrelated if |cos| is at most this value. Sums that cancel have an error
-#: of this size.
+#: Two directions count as orthogonal if |cos| is at most this value. The rounding error of a cosine
+#: has about this size.
 UNRELATED = "1e-14"
 
 
@@ -33,15 +33,15 @@ class Question:
     """The input of an oracle.
 
     Attributes:
-        gramian: [n][n] exact Gramian of the views that have a gradient.
-        places: [n] indices of these views among the K views.
-        views: K.
+        gramian: [n][n] exact Gramian of the n views that have a gradient.
+        places: [n] indices of these views among all K views.
+        views: Number of views K.
         options: Options of the operator.
-        labels: [n] group labels.
-        ratios: [n] camera distances divided by the reference distance.
-        rng: A generator that draws the same numbers as the operator's generator.
-        memory: Values that the oracle stored in the last step. The oracle may change these stored
-            values.
+        labels: [n] labels of the groups of the views.
+        ratios: [n] camera distances, divided by the reference distance.
+        rng: A random generator that draws the numbers that the operator's generator draws.
+        memory: Values that the oracle stored in earlier steps. The oracle may change this
+            dictionary.
     """
 
     gramian: Matrix
@@ -59,50 +59,53 @@ class Question:
         return len(self.places)
 
 
-#: Function that returns the [n] weights.
+#: Function that returns the weights [n] of the views that have a gradient.
 Oracle = Callable[[Question], Vector]
 
 
 def lengths(gramian: Matrix) -> Vector:
-    """Return the norms [n]."""
+    """Return the norms [n] of the gradients."""
     mp = require_mpmath().mp
     return [mp.sqrt(gramian[k][k]) for k in range(len(gramian))]
 
 
 def cosines(gramian: Matrix) -> Matrix:
-    """Return the cosines [n][n]."""
+    """Return the cosines [n][n] of the gradients."""
     n = lengths(gramian)
     size = range(len(n))
     return [[gramian[i][j] / n[i] / n[j] for j in size] for i in size]
 
 
 def is_noise(cosine: Matrix, x: Sequence[Number]) -> bool:
-    """Return True if sum x_k e_k is only rounding noise of exactly opposite directions."""
+    """Return True if sum x_k e_k is only rounding noise of exactly opposite unit gradients e_k."""
     return cancels(form(cosine, x), max(abs(v) for v in x))
 
 
 def cancels(square: Number, largest: Number) -> bool:
-    """Return True if a sum counts as zero, from its square and its longest summand's length."""
+    """Return True if a sum counts as zero.
+
+    `square` is the squared length of the sum, and `largest` is the length of the longest summand.
+    """
     return bool(square <= 2 * number(OPPOSITE) * largest**2)
 
 
 def zeros(count: int) -> Vector:
-    """Return zero weights [n]."""
+    """Return n weights of zero."""
     return [number(0)] * count
 
 
 def sum_of(question: Question) -> Vector:
-    """Return weights of 1."""
+    """Return a weight of 1 for each view."""
     return [number(1)] * question.count
 
 
 def mean_of(question: Question) -> Vector:
-    """Return weights of 1 / K, where K counts all views."""
+    """Return a weight of 1 / K for each view, where K also counts views without a gradient."""
     return [number(1) / question.views] * question.count
 
 
 def preconditioned(question: Question) -> Vector:
-    """Return (r / r_ref)^d with the geometry's exponent d and the ratio in [1e-2, 1e2]."""
+    """Return (r / r_ref)^d with the exponent d of geometry. The ratio is limited to [1e-2, 1e2]."""
     power = number(question.options["geometry"])
     limited = (min(max(number(r), number("0.01")), number(100)) for r in question.ratios)
     return [r**power for r in limited]
@@ -116,7 +119,7 @@ def projected_rows(
     strength: Number = 1,
     shuffled: bool = False,
 ) -> Matrix:
-    """Return the rows v_i [n][n] of pairwise projection."""
+    """Return the rows v_i [n][n] after pairwise projection."""
     return [
         _projected_row(question, i, partners, gate, (threshold, strength))
         for i, partners in enumerate(partners_of(question, shuffled=shuffled))
@@ -124,7 +127,10 @@ def projected_rows(
 
 
 def partners_of(question: Question, *, shuffled: bool) -> list[list[int]]:
-    """Return the partners of each view with a gradient, in the order of projection."""
+    """Return the partners of each view that has a gradient.
+
+    The partners are the other views with a gradient, in the order of projection.
+    """
     order = np.tile(np.arange(question.views), (question.views, 1))
     if shuffled and question.views > 2:  # noqa: PLR2004
         order = question.rng.permuted(order, axis=1)
@@ -136,12 +142,12 @@ def partners_of(question: Question, *, shuffled: bool) -> list[list[int]]:
 
 
 class _Combination:
-    """A sum of terms v_k g_k that grows term by term, and its products with all gradients.
+    """A sum of terms v_k g_k to which terms can be added, and its dot products with all gradients.
 
     Args:
-        gramian: [n][n].
-        norms: [n].
-        i: Index of the first gradient.
+        gramian: [n][n] Gramian.
+        norms: [n] norms of the gradients.
+        i: Index of the gradient with which the sum starts.
     """
 
     def __init__(self, gramian: Matrix, norms: Vector, i: int) -> None:
@@ -152,13 +158,16 @@ class _Combination:
         self.add(i, number(1))
 
     def add(self, j: int, x: Number) -> None:
-        """Add x g_j."""
+        """Add x times the gradient g_j."""
         self.v[j] += x
         self.products = [p + x * g for p, g in zip(self.products, self._gramian[j], strict=True)]
 
     @property
     def length(self) -> Number:
-        """The norm, or exactly zero if it is below 1.4e-6 of the longest summand."""
+        """The length of the sum.
+
+        A length below 1.4e-6 times the longest summand is returned as exactly zero.
+        """
         square = dot(self.v, self.products)
         longest = max(abs(x) * n for x, n in zip(self.v, self._norms, strict=True))
         return number(0) if cancels(square, longest) else require_mpmath().mp.sqrt(square)
@@ -172,7 +181,8 @@ def _projected_row(
     rule: tuple[Number, Number],
 ) -> Vector:
     threshold, strength = rule
-    # A cosine that is exactly at the threshold, where the rule has a jump, is not a conflict.
+    # At a threshold above 0, the rule is not continuous. A cosine exactly at the threshold is
+    # therefore not a conflict.
     least = threshold + (number(OPPOSITE) if threshold else 0)
     norms = lengths(question.gramian)
     row = _Combination(question.gramian, norms, i)
@@ -191,34 +201,34 @@ def _projected_row(
 
 
 def column_sums(rows: Matrix) -> Vector:
-    """Return the weights of a matrix whose rows are added."""
+    """Return the weights for a matrix whose rows are added."""
     return [sum(row[k] for row in rows) for k in range(len(rows[0]))] if rows else []
 
 
 def pcgrad(question: Question) -> Vector:
-    """Return the weights of PCGrad with the operator's random order."""
+    """Return the weights of PCGrad with the random order of the operator."""
     return column_sums(projected_rows(question, shuffled=True))
 
 
 def symmetric(question: Question) -> Vector:
-    """Return the weights of pairwise projection in the order of the slots."""
+    """Return the weights of pairwise projection in the order of the views in the step."""
     return column_sums(projected_rows(question))
 
 
 def soft(question: Question) -> Vector:
-    """Return the weights of projection with threshold and strength."""
+    """Return the weights of projection with a threshold and a strength."""
     threshold, strength = (number(question.options[n]) for n in ("threshold", "strength"))
     return column_sums(projected_rows(question, threshold=threshold, strength=strength))
 
 
 def anchors(question: Question) -> Vector:
-    """Return the weights of projection only between a near and a far view."""
+    """Return the weights of projection between a near and a far view only."""
     pair = set(question.labels) == {question.options["near"], question.options["far"]}
     return symmetric(question) if pair else sum_of(question)
 
 
 def confgate(question: Question) -> Vector:
-    """Return the weights of projection for pairs whose averaged cosine shows a conflict."""
+    """Return the weights of projection for pairs whose average cosine shows a conflict."""
     cosine = cosines(question.gramian)
     confident = {
         (i, j): i != j
@@ -231,7 +241,7 @@ def confgate(question: Question) -> Vector:
 
 
 def _believed(question: Question, pair: tuple[int, int], cosine: Number) -> bool:
-    """Return True if a pair has probably been in conflict; the cosine of this step is included."""
+    """Return True if a pair has probably conflicted for some time, including this step."""
     mp, options = require_mpmath().mp, question.options
     beta = number(options["beta"])
     tau = {"v2": 0.9, "low": 0.6}[options["variant"]] if options["tau"] is None else options["tau"]
@@ -248,7 +258,10 @@ def _believed(question: Question, pair: tuple[int, int], cosine: Number) -> bool
 
 
 def gradvac(question: Question) -> Vector:
-    """Return the weights of GradVac with the operator's random order and stored targets."""
+    """Return the weights of GradVac with stored targets.
+
+    The random order is the order of the operator.
+    """
     rows = [
         _aligned(question, i, partners)
         for i, partners in enumerate(partners_of(question, shuffled=True))
@@ -279,7 +292,7 @@ def _aligned(question: Question, i: int, partners: Sequence[int]) -> Vector:
 
 
 def gradnorm(question: Question) -> Vector:
-    """Return the weights of GradNorm at constant losses: all groups at their initial loss."""
+    """Return the weights of GradNorm if the losses of all groups keep their initial values."""
     mp = require_mpmath().mp
     groups = list(dict.fromkeys(question.labels))
     members = {g: [i for i, label in enumerate(question.labels) if label == g] for g in groups}

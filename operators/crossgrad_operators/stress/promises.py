@@ -1,9 +1,9 @@
-"""The accuracy that each operator promises, and the set of gradients for which it is promised.
+"""The accuracy that each operator guarantees, and the gradients for which it is guaranteed.
 
-Inside the set the relative error is at most `PROMISED` u kappa. u is the unit roundoff of the
-gradients' type, and kappa = max |w_k| |g_k| / |u|. Outside the set the result is finite, and its
-length is at most a stated factor times the longest gradient. A test checks that docs/operators.md
-contains the same texts.
+Inside the set of these gradients, the relative error is at most `PROMISED` u kappa. Here u is the
+unit roundoff of the gradients' type, and kappa = max |w_k| |g_k| / |result|. Outside the set, the
+result is finite. The length of the result is at most a stated factor times the longest gradient. A
+test checks that docs/operators.md lists every operator and its factor.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -22,32 +22,33 @@ from crossgrad_operators.stress.solvers import shortest
 PROMISED: Final = 8.0
 #: Unit roundoff of float64.
 FLOAT64: Final = 2.0**-53
-#: The gradients determine the result if kappa u is at most this value.
+#: The gradients determine the result accurately enough if kappa u is at most this value.
 DETERMINED: Final = 0.1
-#: Directions with a pivot between these values are nearly dependent.
+#: Directions are nearly dependent if a pivot is between these two values.
 DEPENDENT: Final = 1e-29
 INDEPENDENT: Final = 1e-13
-#: Upper limit of the pivots of nearly dependent directions, for methods that divide by every
+#: Upper limit of the pivots of nearly dependent directions, for operators that divide by every
 #: eigenvalue.
 REGULAR: Final = 1e-8
-#: Rounding may increase a bound of 1 by this amount.
+#: Rounding may increase a bound of 1 by up to this amount.
 SLIGHTLY: Final = 1e-3
-#: CAGrad can distinguish cancelling directions from other directions up to this ratio of norms.
+#: Up to this ratio of norms, CAGrad can distinguish directions that cancel from directions that do
+#: not.
 COMPARABLE: Final = 1e8
-#: Solutions are continuous if the distance from the origin to the convex hull of the directions is
-#: at least this value.
+#: Results are continuous if the distance from the origin to the convex hull of the directions is at
+#: least this value.
 APART: Final = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
 class Facts:
-    """The quantities that define the sets: n gradients that are not zero, and the exact result.
+    """The quantities that define the sets, for n gradients that are not zero and their result.
 
     Attributes:
         norms: [n] lengths of the gradients.
-        cosines: [n][n] in 50 digits.
-        weights: [n] exact weights, rounded.
-        length: |u|.
+        cosines: [n][n] cosines of the gradients, with 50 digits.
+        weights: [n] exact weights, rounded to float64.
+        length: Length |u| of the exact result u.
         unit: Unit roundoff of the gradients' type.
     """
 
@@ -64,27 +65,30 @@ class Facts:
 
     @property
     def largest(self) -> float:
-        """The length of the longest weighted gradient, max |w_k| |g_k|."""
+        """Length of the longest weighted gradient, max |w_k| |g_k|."""
         return float(np.abs(self.weights * self.norms).max(initial=0.0))
 
     @property
     def kappa(self) -> float:
-        """The condition number max |w_k| |g_k| / |u|, at least 1; 0 if the exact result is zero."""
+        """Condition number max |w_k| |g_k| / |u|, but at least 1.
+
+        If the exact result is zero, the condition number is 0.
+        """
         if not self.weights.any():
             return 0.0
         return max(self.largest / self.length, 1.0) if self.length else float("inf")
 
     @property
     def ratio(self) -> float:
-        """The length of the longest gradient divided by the length of the shortest."""
+        """Length of the longest gradient divided by the length of the shortest gradient."""
         return self.longest / float(self.norms.min(initial=np.inf))
 
     @cached_property
     def distance(self) -> float:
-        """Distance from the origin to the convex hull of the directions g_k / |g_k|.
+        """Distance from the origin to the convex hull of the unit gradients g_k / |g_k|.
 
         Raises:
-            UnprovenError: The nearest point of the hull was not found.
+            UnprovenError: The nearest point of the convex hull was not found.
         """
         if not self.cosines:
             return 0.0
@@ -93,24 +97,27 @@ class Facts:
 
     @cached_property
     def dependence(self) -> list[float]:
-        """Pivots of the cosines' Cholesky factor, the largest first."""
+        """Pivots of the Cholesky factorization of the cosines, in descending order."""
         return [float(pivot) for pivot in pivots(self.cosines)]
 
     @property
     def sines(self) -> list[float]:
-        """1 - cos^2 of all pairs of gradients."""
+        """1 - cos^2 for all pairs of gradients."""
         pairs = (row[j] for i, row in enumerate(self.cosines) for j in range(i))
         return [float((1 - cosine) * (1 + cosine)) for cosine in pairs]
 
     @property
     def partial(self) -> float:
-        """The sum of |w_1 g_1 + w_2 g_2|, ..., |u| and all |w_k g_k|, relative to a length.
+        """Sum of the lengths of all partial sums and all terms, relative to a length.
 
-        This length is max(|u|, max |w_k g_k|).
+        The partial sums are w_1 g_1 + w_2 g_2, ..., u, and the terms are w_k g_k.
 
-        The value bounds the rounding errors of all products and additions, in units of u kappa.
+        The length for the comparison is max(|u|, max |w_k g_k|).
+
+        The value is a bound for the rounding errors of all products and additions, in units of u
+        kappa.
         """
-        # Divide by the largest term, because its square may overflow in float64.
+        # Divide by the largest term first, because its square may overflow float64.
         unit = self.largest or 1.0
         terms = self.weights * self.norms / unit
         cosines = np.array(self.cosines, dtype=np.float64).reshape(len(terms), len(terms))
@@ -122,25 +129,31 @@ class Facts:
 
 
 def default_bound(facts: Facts) -> float:
-    """Return 8, or the rounding of the weighted sum plus 2 for the weights if this is larger."""
+    """Return 8, or a larger value for many views.
+
+    The larger value is the rounding error of the weighted sum plus 2 for the weights.
+    """
     return max(PROMISED, facts.partial + 2.0)
 
 
 def pairwise_bound(facts: Facts) -> float:
-    """Return the default bound, doubled in float64.
+    """Return the default bound, but twice as large for float64 gradients.
 
-    In float64, Gramians are as coarse as gradients.
+    For float64 gradients, Gramians are only as precise as the gradients.
     """
     return default_bound(facts) * (1.0 if facts.unit > FLOAT64 else 2.0)
 
 
 def views_bound(facts: Facts) -> float:
-    """Return one unit per view, at least 8, because sums of equal signs never become shorter."""
+    """Return the number of views, but at least 8.
+
+    While elements with equal signs are summed, the partial sums never become smaller.
+    """
     return max(PROMISED, float(len(facts.norms)))
 
 
 def everywhere(_facts: Facts) -> bool:
-    """Return True, because the set contains every Gramian."""
+    """Return True, because the set contains all Gramians."""
     return True
 
 
@@ -150,7 +163,7 @@ def determined(facts: Facts) -> bool:
 
 
 def clear(facts: Facts) -> bool:
-    """Return True if `determined` holds and no directions are nearly dependent.
+    """Return True if `determined` is True and no directions are nearly dependent.
 
     Exactly dependent directions are allowed.
     """
@@ -160,9 +173,9 @@ def clear(facts: Facts) -> bool:
 
 
 def independent(facts: Facts) -> bool:
-    """Return True if `determined` holds and no directions are nearly dependent.
+    """Return True if `determined` is True and no directions are nearly dependent.
 
-    With one or two directions, dependence is not tested.
+    For one or two directions, dependence is not tested.
     """
     several = len(facts.norms) > 2  # noqa: PLR2004
     return determined(facts) and not (
@@ -171,15 +184,16 @@ def independent(facts: Facts) -> bool:
 
 
 def comparable(facts: Facts) -> bool:
-    """Return True if `clear` holds.
+    """Return True if `clear` is True and norms are comparable.
 
-    If the hull of the directions contains the origin, norm ratios must also be at most 1e8.
+    If the convex hull of the directions contains the origin, the ratio of norms must be at most
+    1e8.
     """
     return clear(facts) and (facts.ratio <= COMPARABLE or facts.distance >= APART)
 
 
 def hull_apart(facts: Facts) -> bool:
-    """Return True if the hull of the directions is not near the origin."""
+    """Return True if the convex hull of the directions is not near the origin."""
     return facts.distance >= APART
 
 
@@ -189,15 +203,15 @@ def _any_between(values: Sequence[float], low: float, high: float) -> bool:
 
 @dataclass(frozen=True)
 class Promise:
-    """The promise of one operator.
+    """The guarantee of one operator.
 
     Attributes:
         words: Description of the set, with formulas.
-        factor_words: The factor as a formula.
-        factor: K -> bound of |u| / (longest gradient) outside the set.
-        inside: Facts -> True if the Gramian belongs to the set.
-        bound: Facts -> bound of the error inside the set, in units of u kappa.
-        continuous: Facts -> True if the method is continuous in the gradients at these values.
+        factor_words: The factor outside the set, as a formula.
+        factor: Function from K to the largest |u| / (longest gradient) outside the set.
+        inside: Function that returns True if a Gramian belongs to the set.
+        bound: Function that returns the largest error inside the set, in units of u kappa.
+        continuous: Function that returns True if the result is continuous in the gradients.
     """
 
     words: str
@@ -208,32 +222,32 @@ class Promise:
     continuous: Callable[[Facts], bool] = everywhere
 
 
-#: Guarantee for operators that have no guarantee of their own.
+#: Guarantee of operators for which no other guarantee is listed.
 ALL: Final = Promise("all gradients", "infinity", lambda _views: float("inf"), everywhere)
-_DETERMINED: Final = "all Gramians with kappa u <= 0.1, and those whose exact result is zero"
+_DETERMINED: Final = "all Gramians with kappa u <= 0.1, and all Gramians whose exact result is zero"
 _CLEAR: Final = (
-    "of these, those whose directions depend on each other exactly or not nearly: no pivot of the "
-    "cosines' Cholesky factor (50 digits, largest first), and no 1 - cos^2 of a pair, lies between "
+    f"{_DETERMINED}, except Gramians with nearly dependent directions: a pivot of the Cholesky "
+    "factorization of the cosines (50 digits, largest first), or 1 - cos^2 of a pair, lies between "
     "1e-29 and 1e-13"
 )
 _REGULAR: Final = (
-    "of these, those of up to two views, and those with no pivot of the cosines' Cholesky factor "
-    "between 1e-29 and 1e-8"
+    f"{_DETERMINED}, except Gramians of more than two views with a pivot of the Cholesky "
+    "factorization of the cosines between 1e-29 and 1e-8"
 )
 _COMPARABLE: Final = (
-    f"{_CLEAR}; and where a convex combination of the directions vanishes, the longest gradient is "
+    f"{_CLEAR}. If a convex combination of the directions vanishes, the longest gradient must be "
     "at most 1e8 times the shortest"
 )
 
 
 def _plain(words: str, factor: Callable[[int], float]) -> Promise:
-    """Return the promise of an operator without further exceptions."""
+    """Return the guarantee of an operator whose set has no further restrictions."""
     return Promise(_DETERMINED, words, factor)
 
 
 _SUM: Final = _plain("K", float)
 _PAIRS: Final = Promise(_DETERMINED, "K", float, bound=pairwise_bound)
-#: Operator name -> its guarantee.
+#: Name of an operator -> its guarantee.
 PROMISES: Final[Mapping[str, Promise]] = {
     "sum": _SUM,
     "mean": _plain("1", lambda _views: 1.0),
@@ -263,5 +277,5 @@ PROMISES: Final[Mapping[str, Promise]] = {
 
 
 def promise_of(name: str) -> Promise:
-    """Return the promise of the built-in operator with this name."""
+    """Return the guarantee of the built-in operator with this name."""
     return PROMISES.get(name, ALL)

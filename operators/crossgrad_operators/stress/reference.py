@@ -1,4 +1,4 @@
-"""The oracle of each operator, and the oracle's answer for a case."""
+"""The oracle of each operator, and the oracle's result for a case."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from crossgrad_operators.stress import oracles, solvers
 from crossgrad_operators.stress.exact import Matrix, Number, apply, number, require_mpmath
 from crossgrad_operators.stress.oracles import Oracle, Question, column_sums
 
-#: Operator name -> its oracle. Other operators are checked without an oracle.
+#: Name of an operator -> its oracle. Other operators are checked without an oracle.
 ORACLES: Final[Mapping[str, Oracle]] = {
     "sum": oracles.sum_of,
     "mean": oracles.mean_of,
@@ -32,7 +32,7 @@ ORACLES: Final[Mapping[str, Oracle]] = {
     "dispatch": oracles.symmetric,
 }
 
-#: Options that make an operator active from the first step on.
+#: Options with which operators change gradients from the first step on.
 OPTIONS: Final[Mapping[str, Mapping[str, Any]]] = {
     "confgate": {"warmup": 0},
     "soft": {"threshold": 0.25, "strength": 0.5},
@@ -42,7 +42,10 @@ OPTIONS: Final[Mapping[str, Mapping[str, Any]]] = {
 
 
 def chained(question: Question) -> list[Number]:
-    """Return the weights of the chain in `OPTIONS`: precondition, then project, then average."""
+    """Return the weights of the chain in `OPTIONS`.
+
+    The chain preconditions, then projects, then averages.
+    """
     factors = oracles.preconditioned(Question(**{**vars(question), "options": {"geometry": 2.0}}))
     inner = _between(question.gramian, factors)
     rows = oracles.projected_rows(Question(**{**vars(question), "gramian": inner}))
@@ -58,12 +61,12 @@ def _between(gramian: Matrix, factors: Sequence[Number]) -> Matrix:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """The answer of exact arithmetic.
+    """The result of exact arithmetic.
 
     Attributes:
-        weights: [K] weights, zero for views without a gradient.
-        length: |u|.
-        largest: max |w_k| |g_k|.
+        weights: [K] weights; zero for views without a gradient.
+        length: Length |u| of the result.
+        largest: Length of the longest weighted gradient, max |w_k| |g_k|.
     """
 
     weights: list[Number]
@@ -78,7 +81,7 @@ def answer(
     memory: dict[Any, Any],
     options: Mapping[str, Any],
 ) -> Answer:
-    """Return the oracle's answer for the views that have a gradient."""
+    """Return the oracle's result for all views that have a gradient."""
     mp = require_mpmath().mp
     places = [k for k in range(len(gramian)) if gramian[k][k] > 0]
     reduced_gramian = [[gramian[i][j] for j in places] for i in places]
@@ -103,12 +106,12 @@ def answer(
 
 @dataclass(frozen=True)
 class Views:
-    """The properties of K views that some operators use.
+    """Properties of K views that some operators read.
 
     Attributes:
-        labels: [K] group labels.
-        ratios: [K] camera distances divided by the reference distance.
-        seed: Seed of the operator's generator in this step.
+        labels: [K] labels of the groups.
+        ratios: [K] camera distances, divided by the reference distance.
+        seed: Seed of the operator's random generator in this step.
     """
 
     labels: tuple[str, ...]
@@ -117,6 +120,6 @@ class Views:
 
 
 def sample_views(count: int, seed: int = 0) -> Views:
-    """Return alternating near and far views at distances around the reference distance."""
+    """Return views that are alternately near and far, at distances near the reference distance."""
     labels = tuple(("near", "far")[k % 2] for k in range(count))
     return Views(labels, tuple(0.5 + 0.25 * k for k in range(count)), seed)

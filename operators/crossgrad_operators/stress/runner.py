@@ -1,4 +1,4 @@
-"""Run one operator on one case and judge the result."""
+"""Run one operator on one test case, and check the result."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,13 +24,13 @@ from crossgrad_operators.stress.reference import Answer, Views, answer, sample_v
 from crossgrad_operators.stress.solvers import UnprovenError
 from crossgrad_operators.stress.verdict import ElementRule, ExactCase, Finding, judge
 
-#: The only block of a case.
+#: The only block of a test case.
 BLOCK = Block("means", ("means",), False, "geometry", LearningRate(1.0))
-#: A case is repeated to measure its time if it has at most this number of elements.
+#: To measure the time, a case with at most this number of elements is repeated.
 REPEATED = 100_000
-#: Number of steps for operators with memory.
+#: Number of steps for operators that store values between steps.
 STEPS = 3
-#: Reason of a failure if the answer of the reference is not proven.
+#: Reason of a failure if the oracle could not prove its result.
 UNPROVEN = "the reference is not proven"
 
 
@@ -38,11 +38,14 @@ UNPROVEN = "the reference is not proven"
 class Cell:
     """The result of one operator on one case, or for one law.
 
+    A law is a property that every operator must have.
+
     Attributes:
         operator: Name of the operator.
         case: Name of the case.
-        finding: The worst finding of its steps.
-        microseconds: Time of one aggregation, including Gramians and weighted sum.
+        finding: The worst finding over all steps.
+        microseconds: Time of one aggregation in microseconds, including Gramians and the weighted
+            sum.
     """
 
     operator: str
@@ -53,13 +56,13 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """The reference for an operator.
+    """The reference with which the results of an operator are compared.
 
     Attributes:
-        oracle: Function that returns exact weights, or None.
-        options: Options of the operator, for the oracle.
-        rule: A rule for single elements, for operators that work on elements.
-        promise: The set for which an error is promised, and the bounds outside the set.
+        oracle: Function that returns exact weights; None without an oracle.
+        options: Options of the operator, which the oracle receives.
+        rule: Rule for single elements, for an operator that works on elements.
+        promise: The set for which an accuracy is guaranteed, and the bounds outside the set.
     """
 
     oracle: Oracle | None
@@ -69,7 +72,10 @@ class Reference:
 
 
 def run_case(name: str, operator: Operator, exact: ExactCase, reference: Reference) -> Cell:
-    """Run an operator (several steps if it has memory) and judge every result."""
+    """Run an operator on a case and check every result.
+
+    An operator that stores values runs for several steps.
+    """
     case = exact.case
     if not operator.views.admits(case.views):
         return Cell(name, case.name, Finding("refused"))
@@ -85,13 +91,15 @@ def judged(
     reference: Reference,
     views_of: Callable[[int, int], Views] = sample_views,
 ) -> tuple[Finding, list[float]]:
-    """Return the worst finding over an operator's steps, and their seconds (none after a failure).
+    """Return the worst finding over all steps, and the seconds of each step.
+
+    After a failure, the list of seconds is empty.
 
     Args:
-        operator: The operator.
-        exact: The case.
-        reference: The reference for the results.
-        views_of: (K, step) -> the properties of the views.
+        operator: The operator to check.
+        exact: The test case.
+        reference: The reference for the operator's results.
+        views_of: Function from (K, step) to the properties of the views.
     """
     state = EMPTY_STATE
     memory: dict[Any, Any] = {}
@@ -101,7 +109,7 @@ def judged(
         try:
             result, state, seconds = timed(operator, exact.case, views, state)
         except Exception as error:
-            # Operators of other packages may raise any exception.
+            # An operator of another package may raise any exception.
             return Finding("failed", reason=f"{type(error).__name__}: {error}"), []
         times.append(seconds)
         finding = compared(exact, result, reference, views, memory)
@@ -120,7 +128,10 @@ def compared(
     views: Views,
     memory: dict[Any, Any],
 ) -> Finding:
-    """Compare a result with its reference. The oracle may change the values that it stored."""
+    """Compare a result with its reference.
+
+    `memory` contains the values that the oracle stores. The stored values may change in this call.
+    """
     expected: Answer | ElementRule | None = reference.rule
     try:
         if reference.oracle is not None:
@@ -133,7 +144,7 @@ def compared(
 def timed(
     operator: Operator, case: Case, views: Views, state: PluginState = EMPTY_STATE
 ) -> tuple[Tensor | None, PluginState, float]:
-    """Return the aggregated gradient of a case, the operator's new state, and the seconds."""
+    """Return the aggregated gradient of a case, the new state of the operator, and the seconds."""
     gradients = [{BLOCK.name: gradient} for gradient in case.gradients()]
     context = context_of(gradients, (BLOCK,), views)
     start = perf_counter()
@@ -144,7 +155,7 @@ def timed(
 def context_of(
     gradients: Sequence[Mapping[str, Tensor | None]], blocks: tuple[Block, ...], views: Views
 ) -> AggregateContext:
-    """Return the context of an aggregation. Scene and schedule are None."""
+    """Return the context for an aggregation. The scene and the schedule are None."""
     return AggregateContext(
         step=1,
         schedule=cast("Any", None),

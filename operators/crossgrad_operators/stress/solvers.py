@@ -1,9 +1,9 @@
-"""Oracles in 50 digits that solve small optimization problems.
+"""Oracles with 50 digits for operators that solve small optimization problems.
 
-The operators use active sets in float64, on cosines that a ridge makes definite. The oracles use
-exact active sets. Every result is checked against the optimality conditions. These conditions have
-only one solution, so the result is the minimum. If the gradients are linearly dependent, the
-weights are not unique, and the weights of independent gradients are returned.
+The operators use active sets in float64, and add a ridge to the cosine matrix. The oracles use
+active sets without a ridge. Every result is checked against the optimality conditions. Only the
+minimum meets these conditions. If gradients are linearly dependent, the weights are not unique. For
+linearly dependent gradients, the oracles return weights of independent gradients.
 """
 
 from collections.abc import Sequence
@@ -34,28 +34,33 @@ from crossgrad_operators.stress.oracles import (
     zeros,
 )
 
-#: Number of digits for matrices whose eigenvalues differ by 60 decades.
+#: Number of digits for matrices whose eigenvalues differ by a factor of up to 1e60.
 WIDE: Final = 150
-#: The first solution, in float64, ends at this Newton decrement or if a beta reaches the second
-#: value.
+#: The first iteration runs in float64. The iteration ends at the Newton decrement `ROUGH`, or when
+#: an element of beta reaches `LONG`.
 ROUGH: Final = 1e-3
 LONG: Final = 1e7
-#: If the smallest eigenvalue divided by the largest is above this value, float64 determines the
-#: rank without doubt.
+#: If the smallest eigenvalue divided by the largest is above this value, float64 is accurate enough
+#: to determine the rank.
 FAR: Final = 1e-10
-#: A sum counts as zero if |sum x_k e_k|^2 divided by the largest x_k^2 is at most this value, in 50
-#: digits.
+#: A sum counts as zero if |sum x_k e_k|^2, divided by the largest x_k^2, is at most this value.
 VANISHED = "1e-45"
-#: Maximum number of levels that are tried for CAGrad.
+#: Largest number of levels that the search of CAGrad tries.
 LEVELS = 400
 
 
 class UnprovenError(RuntimeError):
-    """The oracle found no point that meets the optimality conditions."""
+    """The oracle found no point that meets the optimality conditions.
+
+    The result of the oracle is not proven.
+    """
 
 
 def imtl_g(question: Question) -> Vector:
-    """Return weights of equal projections with sum 1, by pseudo-inverse for a singular Gramian."""
+    """Return weights with sum 1 and equal projections.
+
+    For a singular Gramian, the pseudo-inverse is used.
+    """
     gramian, count = question.gramian, question.count
     n, cosine = lengths(gramian), cosines(gramian)
     if count == 1:
@@ -66,8 +71,8 @@ def imtl_g(question: Question) -> Vector:
         return zeros(2) if opposite else [n[1] / total, n[0] / total]
     v = _equal_projections(gramian, n, cosine)
     total, largest = sum(v), max(abs(x) for x in v)
-    # The sum of all elements of v is in the denominator. It counts as zero by the rule for
-    # cancelling sums.
+    # The sum of all elements of v is a denominator. The rule for cancelling sums decides whether
+    # this sum counts as zero.
     if cancels(total**2, largest) or is_noise(cosine, [x * y for x, y in zip(v, n, strict=True)]):
         return zeros(count)
     return [x / total for x in v]
@@ -79,17 +84,17 @@ def _equal_projections(gramian: Matrix, n: Vector, cosine: Matrix) -> Vector:
         v = solve(cosine, range(count), [number(1)] * count)
         if v is not None:
             return [x / y for x, y in zip(v, n, strict=True)]
-    # Use more digits, because the largest eigenvalue may exceed the smallest eigenvalue by 60
-    # decades.
+    # Use more digits, because the largest eigenvalue may be 1e60 times the smallest eigenvalue.
     with require_mpmath().mp.workdps(WIDE):
         return _shortest_solution(gramian, n, rank)
 
 
 def _rank(cosine: Matrix) -> int:
-    """Return the number of eigenvalues above 1e-12 of the largest."""
+    """Return the number of eigenvalues above 1e-12 times the largest eigenvalue."""
     mp = require_mpmath().mp
     rough = np.linalg.eigvalsh(np.array(cosine, dtype=np.float64))
-    # float64 is accurate to 1e-14. This is enough if all eigenvalues are far above the limit.
+    # Eigenvalues in float64 have errors of about 1e-14. An error of 1e-14 does not matter if all
+    # eigenvalues are far above the limit.
     if rough.min() > FAR * rough.max():
         return len(cosine)
     values, _ = mp.eigsy(mp.matrix(cosine))
@@ -103,8 +108,8 @@ def _shortest_solution(gramian: Matrix, n: Vector, rank: int) -> Vector:
     v = zeros(count)
     for i in largest:
         terms = [vectors[k, i] * n[k] for k in range(count)]
-        # Skip vectors that are orthogonal to the norms, because their terms would be rounding noise
-        # divided by an eigenvalue.
+        # Skip eigenvectors that are orthogonal to the norms. The terms of these eigenvectors would
+        # be rounding noise, divided by an eigenvalue.
         if abs(sum(terms)) > number(OPPOSITE) * sum(abs(t) for t in terms):
             factor = sum(terms) / values[i]
             v = [a + factor * vectors[k, i] for k, a in enumerate(v)]
@@ -112,7 +117,10 @@ def _shortest_solution(gramian: Matrix, n: Vector, rank: int) -> Vector:
 
 
 def nash(question: Question) -> Vector:
-    """Return the solution of C beta = 1 / beta, times the geometric mean of the norms."""
+    """Return the Nash-MTL weights, from the solution beta of C beta = 1 / beta with cosines C.
+
+    The weights are multiplied by the geometric mean of the norms.
+    """
     mp = require_mpmath().mp
     n, cosine = lengths(question.gramian), cosines(question.gramian)
     count = question.count
@@ -128,7 +136,10 @@ def nash(question: Question) -> Vector:
 
 
 def _bargain(cosine: Matrix) -> Vector | None:
-    """Return the bargain's beta, or None if beta is so large that the result is zero."""
+    """Return the solution beta of the bargaining problem.
+
+    Return None if beta is so large that the result is zero.
+    """
     mp = require_mpmath().mp
     count = len(cosine)
     beta = _rough_bargain(cosine)
@@ -146,14 +157,14 @@ def _bargain(cosine: Matrix) -> Vector | None:
         decrement = mp.sqrt(abs(dot(slope, step)))
         damping = 1 if decrement < number("0.2") else 1 / (1 + decrement)
         beta = [b * (1 + damping * s) for b, s in zip(beta, step, strict=True)]
-        # Stop at this decrement, because the last step has already squared the remaining error.
+        # The last step has squared the remaining error, so that the solution is accurate now.
         if decrement < mp.mpf("1e-25"):
             return beta
     raise UnprovenError
 
 
 def _rough_bargain(cosine: Matrix) -> Vector:
-    """Return a start for Newton's method, from damped Newton steps in float64."""
+    """Return a start for Newton's method, computed by damped Newton steps in float64."""
     matrix = np.array(cosine, dtype=np.float64)
     beta = np.ones(len(cosine))
     for _ in range(200):
@@ -169,17 +180,18 @@ def _rough_bargain(cosine: Matrix) -> Vector:
 
 
 def _is_hopeless(cosine: Matrix, beta: Vector) -> bool:
-    """Return True if the convex combination beta / sum beta proves that the result is zero.
+    """Return True if the combination x = beta / sum beta proves that the result is zero.
 
-    x is this combination and u the sum of the bargain, with |u|^2 = K. Then sum x_k / beta_k = sum
-    x_k e_k.u is at most |sum x_k e_k| sqrt K. The inverse of the largest beta has the same bound.
+    Let u be the sum of the bargaining solution, with |u|^2 = K. Then sum x_k / beta_k = sum x_k
+    e_k.u is at most |sum x_k e_k| sqrt(K). The inverse of the largest beta is at most as large as
+    this bound.
     """
     share = form(cosine, beta) / sum(beta) ** 2
     return bool(len(beta) * share <= 2 * number(OPPOSITE) / len(beta))
 
 
 def aligned(question: Question) -> Vector:
-    """Return sqrt(l_min) V L^-1/2 V^T p with eigenvalues above n eps l_max."""
+    """Return the weights of Aligned-MTL, using eigenvalues above n eps l_max."""
     mp = require_mpmath().mp
     count = question.count
     cosine = cosines(question.gramian)
@@ -200,14 +212,17 @@ def aligned(question: Question) -> Vector:
 
 
 def _vanishes(cosine: Matrix, x: Vector) -> bool:
-    """Return True if a combination is zero. Two directions may also count as opposite."""
+    """Return True if a combination is zero.
+
+    For two directions, the sum of exactly opposite directions also counts as zero.
+    """
     largest = max(abs(v) for v in x)
     exactly = form(cosine, x) <= number(VANISHED) * largest**2
     return exactly or (len(x) == 2 and is_noise(cosine, x))  # noqa: PLR2004
 
 
 def _projection(cosine: Matrix, b: Vector) -> Vector:
-    """Return coefficients of the projection of sum b_k e_k onto the cone {x: x.e_l >= 0}."""
+    """Return the coefficients of the projection of sum b_k e_k onto the cone {x: x.e_l >= 0}."""
     y = complementary(cosine, apply(cosine, b))
     if y is None:
         raise UnprovenError
@@ -216,7 +231,7 @@ def _projection(cosine: Matrix, b: Vector) -> Vector:
 
 
 def upgrad(question: Question) -> Vector:
-    """Return the weights of the projected gradients, divided by K."""
+    """Return the weights of the sum of all projected gradients, divided by K."""
     n, cosine = lengths(question.gramian), cosines(question.gramian)
     rows = []
     for k in range(question.count):
@@ -226,7 +241,7 @@ def upgrad(question: Question) -> Vector:
 
 
 def dualproj(question: Question) -> Vector:
-    """Return the weights of the projected mean."""
+    """Return the weights of the projected mean gradient."""
     n, cosine = lengths(question.gramian), cosines(question.gramian)
     longest = max(n)
     x = _projection(cosine, [v / longest for v in n])
@@ -246,10 +261,10 @@ def mgda(question: Question) -> Vector:
 
 
 def shortest(cosine: Matrix, r: Sequence[Number]) -> Vector:
-    """Return coefficients x >= 0 with r.x = 1 of the shortest sum x_k e_k.
+    """Return the coefficients x >= 0 with r.x = 1 for which sum x_k e_k is shortest.
 
-    Up to a factor, these coefficients minimize |sum x_k e_k|^2 + (r.x - 1)^2. This problem has a
-    solution even if 0 is a convex combination.
+    Up to a factor, these coefficients minimize |sum x_k e_k|^2 + (r.x - 1)^2. The minimization has
+    a solution even if 0 is a convex combination of the directions.
     """
     size = range(len(r))
     matrix = [[cosine[i][j] + r[i] * r[j] for j in size] for i in size]
@@ -261,7 +276,10 @@ def shortest(cosine: Matrix, r: Sequence[Number]) -> Vector:
 
 
 def cagrad(question: Question) -> Vector:
-    """Return the weights of g_0 + c |g_0| g_w / |g_w|, from the nearest point at a level."""
+    """Return the weights of g_0 + c |g_0| g_w / |g_w|.
+
+    The oracle searches for the nearest point at a level.
+    """
     mp = require_mpmath().mp
     count, c = question.count, number(question.options["c"])
     share = number(count) / question.views
@@ -280,10 +298,13 @@ def cagrad(question: Question) -> Vector:
 
 
 def _as_far_as(cosine: Matrix, base: Vector, r: Vector, rho: Number) -> Vector | None:
-    """Return multipliers of the nearest point to the base with e_k.d >= level r_k, at distance rho.
+    """Return the multipliers of the point nearest to `base` with e_k.d >= level r_k.
 
-    None is returned if 0 is a convex combination and level 0 is reached within this distance. Then
-    no level above 0 can be reached, and the direction is undefined.
+    The level is the one for which the distance is rho.
+
+    Return None if 0 is a convex combination and level 0 is reached within this distance. If level 0
+    is reached within this distance, no level above 0 can be reached, and the direction is
+    undefined.
     """
     q = apply(cosine, base)
     x = shortest(cosine, r)
@@ -302,7 +323,10 @@ def _as_far_as(cosine: Matrix, base: Vector, r: Vector, rho: Number) -> Vector |
 def _found(
     cosine: Matrix, problem: tuple[Vector, Vector, Number], interval: tuple[Number, Number]
 ) -> Vector:
-    """Return the multipliers for distance rho. Every level of the interval must be reachable."""
+    """Return the multipliers for which the distance is rho.
+
+    All levels in the interval must be reachable.
+    """
     (q, r, rho), (low, high) = problem, interval
     level = high
     for _ in range(LEVELS):
@@ -321,7 +345,10 @@ def _found(
 
 
 def _change(cosine: Matrix, y: Vector, r: Vector, gap: Number) -> Number | None:
-    """Return the change of level that closes the gap of the squared distance on the active face."""
+    """Return the change of the level after which the distance is rho.
+
+    The active constraints are assumed not to change.
+    """
     mp = require_mpmath().mp
     support = [k for k, v in enumerate(y) if v > 0]
     a = solve(cosine, support, r) if support else None

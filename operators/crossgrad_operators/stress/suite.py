@@ -1,4 +1,4 @@
-"""The whole suite: every operator on every case and every law, with the results as text."""
+"""The complete test suite: all operators on all cases and all laws, with the results as text."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -20,19 +20,20 @@ from crossgrad_operators.stress.reference import OPTIONS, ORACLES, Views, chaine
 from crossgrad_operators.stress.runner import BLOCK, Cell, Reference, context_of, run_case, timed
 from crossgrad_operators.stress.verdict import ExactCase, Finding, one_sign
 
-#: Function that returns the error of a law in units of u times the largest norm, or None if the law
-#: does not apply.
+#: Function that returns the error of a law in units of u times the largest norm. If the law does
+#: not apply, the function returns None.
 Law = Callable[[Operator], float | None]
 _UNIT = 2.0**-24
 #: Number of operators in one part of the table.
 COLUMNS = 5
 _NAME, _CELL = 24, 16
 LEGEND = (
-    "Each cell: relative error in units of u kappa (8 is promised) and microseconds.\n"
-    "u: unit roundoff of the gradients' type; kappa = max |w_k| |g_k| / |u|, at least 1.\n"
-    "~ kappa u > 0.1, finite is all that is promised; * outside the operator's set\n"
-    "(docs/operators.md): finite and not too long; - K is refused; FAIL see below.\n"
-    "Without an error: no reference; finite, and the laws at the end hold."
+    "Each cell: relative error in units of u kappa (at most 8 is guaranteed), and microseconds.\n"
+    "u: unit roundoff of the gradients' type. kappa: max |w_k| |g_k| / |result|, at least 1.\n"
+    "~ kappa u > 0.1: the result is only guaranteed to be finite.\n"
+    "* outside the operator's set (docs/operators.md): the result is finite and not too long.\n"
+    "- the operator refuses this number of gradients. FAIL: the failures are listed at the end.\n"
+    "A cell without an error has no reference: the result is finite and the laws hold."
 )
 
 
@@ -59,7 +60,7 @@ def _counts(operator: Operator) -> Iterator[int]:
 
 
 def homogeneity(operator: Operator) -> float | None:
-    """Return the error of op(c g) = c op(g), for c > 0 from 1e-25 to 1e+25."""
+    """Return the error of the law op(c g) = c op(g), for factors c of 2^-80, 3 and 2^80."""
     worst = 0.0
     for views in _counts(operator):
         case = _rows(views)
@@ -72,7 +73,7 @@ def homogeneity(operator: Operator) -> float | None:
 
 
 def permutation(operator: Operator) -> float | None:
-    """Return the error after two views change places, together with their labels and distances."""
+    """Return the error after two views were exchanged together with their labels and distances."""
     if not operator.views.admits(2):
         return None
     case, views = _rows(2), sample_views(2)
@@ -83,9 +84,9 @@ def permutation(operator: Operator) -> float | None:
 
 
 def one_view(operator: Operator) -> float | None:
-    """Return the change of a single view at the reference distance.
+    """Return how much an operator changes a single view at the reference distance.
 
-    An operator should not change the view, so the expected value is 0.
+    An operator should not change a single view, so that the expected value is 0.
     """
     if not operator.views.admits(1):
         return None
@@ -95,9 +96,9 @@ def one_view(operator: Operator) -> float | None:
 
 
 def size(operator: Operator) -> float | None:
-    """Return the error for a gradient that is repeated 3,001 times.
+    """Return the error for gradients that are repeated 3,001 times.
 
-    The reference is the result for the short gradient, repeated as often.
+    The reference is the result for the original gradients, repeated as often.
     """
     if not isinstance(operator, MatrixOperator):
         return None
@@ -113,7 +114,7 @@ def size(operator: Operator) -> float | None:
 
 
 def block_independence(operator: Operator) -> float | None:
-    """Return 0 if other blocks in the same step change no bit of a block's result, else inf."""
+    """Return 0 if other blocks in a step do not change the bits of a block's result, else inf."""
     if not isinstance(operator, MatrixOperator):
         return None
     for views in _counts(operator):
@@ -128,7 +129,7 @@ def block_independence(operator: Operator) -> float | None:
 
 
 def threads(operator: Operator) -> float | None:
-    """Return 0 if the number of threads changes no bit, else inf."""
+    """Return 0 if the number of threads does not change the bits of the result, else inf."""
     import numba
 
     case = replace(_rows(2), pattern=_rows(2).head, copies=8000)
@@ -149,7 +150,7 @@ LAWS: tuple[Law, ...] = (homogeneity, permutation, one_view, size, block_indepen
 
 
 def run_law(name: str, operator: Operator, law: Law) -> Cell:
-    """Return the finding about one law for one operator."""
+    """Return the result of one law for one operator."""
     return Cell(name, law.__name__.replace("_", " "), _judged(operator, law))
 
 
@@ -157,7 +158,7 @@ def _judged(operator: Operator, law: Law) -> Finding:
     try:
         error = law(operator)
     except Exception as problem:
-        # Operators of other packages may raise any exception.
+        # An operator of another package may raise any exception.
         return Finding("failed", reason=f"{type(problem).__name__}: {problem}")
     if error is None:
         return Finding("refused")
@@ -171,23 +172,24 @@ def _reversed(gradient: Tensor | None) -> Tensor | None:
 
 
 def installed() -> list[str]:
-    """Return the names of all operators, including operators of third parties."""
+    """Return the names of all installed operators, including operators of other packages."""
     return installed_names("operators")
 
 
 def made(name: str) -> Operator:
-    """Return an operator with the options that the suite uses."""
+    """Return an operator with the options that the test suite uses."""
     return build(Operator, name, OPTIONS.get(name, {}))
 
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """An operator with its references.
+    """An operator together with its reference.
 
     Attributes:
         name: Name of the operator.
         operator: The operator.
-        reference: The operator's 50-digit oracle or its rule for elements, if there is one.
+        reference: The operator's oracle with 50 digits, or its rule for elements; empty for
+            operators of other packages.
     """
 
     name: str
@@ -196,15 +198,17 @@ class Subject:
 
     @property
     def promise(self) -> Promise:
-        """The promise of the operator."""
+        """The guarantee of the operator."""
         return self.reference.promise
 
 
 def subject_of(name: str) -> Subject:
-    """Return the installed operator with a name, and its references if it is built-in.
+    """Return the installed operator with a name.
+
+    If the operator is built-in, its reference is included.
 
     Raises:
-        UserError: The operator does not exist or cannot be made.
+        UserError: The operator does not exist or cannot be created.
     """
     operator = made(name)
     return Subject(name, operator, reference_of(name, operator))
@@ -213,10 +217,10 @@ def subject_of(name: str) -> Subject:
 def run_suite(
     names: Sequence[str], cases: Sequence[Case], progress: Callable[[str], None] = lambda _: None
 ) -> Iterator[Cell]:
-    """Yield the cells of all operators, case by case, and then the laws.
+    """Yield the results of all operators: first for each case, then for each law.
 
     Raises:
-        UserError: mpmath is not installed, or an operator cannot be made.
+        UserError: mpmath is not installed, or an operator cannot be created.
     """
     mpmath = require_mpmath()
     subjects = [subject_of(name) for name in names]
@@ -232,7 +236,10 @@ def run_suite(
 
 
 def reference_of(name: str, operator: Operator) -> Reference:
-    """Return the reference of a built-in operator. Third-party operators have no reference."""
+    """Return the reference of a built-in operator.
+
+    Operators of other packages have no reference.
+    """
     options: dict[str, Any] = {
         field: getattr(operator, field) for field in type(operator).model_fields
     }
@@ -245,7 +252,7 @@ def reference_of(name: str, operator: Operator) -> Reference:
 
 
 def as_text(cells: Sequence[Cell]) -> str:
-    """Return the whole table, the worst error of each operator, and the failures."""
+    """Return the complete table, the worst error of each operator, and all failures."""
     names = list(dict.fromkeys(cell.operator for cell in cells))
     parts = [
         _part(cells, names[start : start + COLUMNS]) for start in range(0, len(names), COLUMNS)
@@ -254,12 +261,12 @@ def as_text(cells: Sequence[Cell]) -> str:
 
 
 def failed(cells: Sequence[Cell]) -> list[Cell]:
-    """Return the cells that break a promise."""
+    """Return the results that break a guarantee."""
     return [cell for cell in cells if cell.finding.verdict == "failed"]
 
 
 def write_csv(cells: Sequence[Cell], path: Path) -> None:
-    """Write one row per cell."""
+    """Write one row for each result."""
     rows: list[dict[str, str | int | float]] = [
         {
             "operator": cell.operator,

@@ -1,4 +1,4 @@
-"""Verdicts that compare the error of a result with the promise."""
+"""Compare the error of a result with the guarantee, and return a verdict."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,15 +20,15 @@ from crossgrad_operators.stress.oracles import cosines, lengths
 from crossgrad_operators.stress.promises import ALL, Facts, Promise
 from crossgrad_operators.stress.reference import Answer
 
-#: If kappa u is above this value, only finiteness is guaranteed, because the input does not
-#: determine the result.
+#: If kappa u is above this value, the gradients do not determine the result. For a larger kappa u,
+#: only a finite result is guaranteed.
 UNDETERMINED: Final = 0.1
-#: Failure reason of a result that contains a NaN or an infinity.
+#: Reason of a failure if a result contains NaN or infinity.
 NOT_FINITE: Final = "not finite"
 
 Verdict = Literal["ok", "undetermined", "outside", "refused", "failed"]
 
-#: Function that returns the distance of a result from the nearest result that a rule for elements
+#: Function that returns the distance from a result to the nearest result that a rule for elements
 #: allows.
 ElementRule = Callable[[Case, Tensor], float]
 
@@ -38,12 +38,12 @@ class Finding:
     """The verdict on one result.
 
     Attributes:
-        verdict: `ok`; `undetermined`: kappa u > 0.1 and finite; `outside`: outside the set for
-            which an error is promised, finite and not too long; `refused`: K is not admitted;
-            `failed`.
-        error: Relative error in units of u kappa, or NaN without a reference.
-        reason: Reason of a failure.
-        ratio: |u| divided by the longest gradient, or NaN inside the set.
+        verdict: `ok`, `undetermined` (kappa u > 0.1, result finite), `outside`, `refused` (K is not
+            supported) or `failed`. The verdict `outside` means: outside the set with a guaranteed
+            accuracy, finite, and not too long.
+        error: Relative error in units of u kappa; NaN without a reference.
+        reason: Reason of the failure; empty without a failure.
+        ratio: Length |u| of the result, divided by the longest gradient; NaN inside the set.
     """
 
     verdict: Verdict
@@ -53,18 +53,18 @@ class Finding:
 
     @property
     def is_outside(self) -> bool:
-        """True if the gradients are outside the set for which an error is promised."""
+        """True if the gradients are outside the set for which an accuracy is guaranteed."""
         return not isnan(self.ratio)
 
     @property
     def severity(self) -> tuple[int, float]:
-        """Sort key for the worst of several findings."""
+        """Sort key by which the worst of several findings is found."""
         order = ("ok", "outside", "undetermined", "refused", "failed")
         return order.index(self.verdict), self.error
 
 
 class ExactCase:
-    """A case with its exact Gramian, computed once for all operators."""
+    """A case with its exact Gramian, which is computed once for all operators."""
 
     def __init__(self, case: Case) -> None:
         self.case = case
@@ -73,7 +73,7 @@ class ExactCase:
 
     @property
     def touched(self) -> bool:
-        """True if a finite view touches the block."""
+        """True if at least one view has a finite gradient."""
         return any(f and k not in self.case.absent for k, f in enumerate(self.finite))
 
 
@@ -83,7 +83,10 @@ def judge(
     expected: Answer | ElementRule | None,
     promise: Promise = ALL,
 ) -> Finding:
-    """Compare a result with exact weights, with a rule for elements, or only for finiteness."""
+    """Compare a result with exact weights or with a rule for elements.
+
+    If neither is available, check only that the result is finite.
+    """
     if found is None or not exact.touched:
         return _either(
             found is None and not exact.touched, "None is expected only for blocks without any view"
@@ -98,7 +101,7 @@ def judge(
 
 
 def by_law(exact: ExactCase, found: Tensor, error: float, promise: Promise = ALL) -> Finding:
-    """Judge a result by its distance from the nearest result that a rule or a law allows."""
+    """Check a result by its distance from the nearest result that a rule or a law allows."""
     longest = sqrt(float(max(exact.gramian[k][k] for k in range(exact.case.views))))
     scale = max(longest, float(found.double().norm()))
     return _measured(exact.case, error, (scale, scale), promise.bound(facts_of(exact)))
@@ -115,7 +118,10 @@ def _against(exact: ExactCase, found: Tensor, expected: Answer, promise: Promise
 
 
 def facts_of(exact: ExactCase, answer: Answer | None = None) -> Facts:
-    """Return the facts that define the sets. Without an answer, weights and length are zero."""
+    """Return the quantities that define the sets.
+
+    Without an answer, the weights and the length are zero.
+    """
     gramian = exact.gramian
     places = [k for k in range(exact.case.views) if gramian[k][k] > 0]
     reduced_gramian = [[gramian[i][j] for j in places] for i in places]
@@ -150,7 +156,7 @@ def _outside(case: Case, found: Tensor, facts: Facts, promise: Promise) -> Findi
 
 def _measured(case: Case, error: float, sizes: tuple[float, float], bound: float) -> Finding:
     unit, (scale, length) = _unit(case), sizes
-    # Gradual underflow causes an absolute error in each element, so subtract this error.
+    # Gradual underflow causes an absolute error in each element. Subtract this error.
     lost = sqrt(case.size) * float(torch.finfo(case.dtype).smallest_normal) * unit
     error = max(error - lost, 0.0)
     measured = error / (unit * scale) if error else 0.0
@@ -162,11 +168,15 @@ def _measured(case: Case, error: float, sizes: tuple[float, float], bound: float
 
 
 def distance(case: Case, found: Tensor, expected: Answer) -> float:
-    """Return |u - u*|: in 50 digits for the head, in float64 for the repeated pattern."""
+    """Return the distance |u - u*| between a result and the exact result.
+
+    The head is compared with 50 digits, the pattern in float64.
+    """
     values = found.detach().double().numpy()
     head = case.head.shape[1]
     exact = weighted_sum(expected.weights, case.exact_head)
-    # Subtract in 50 digits, because the leading digits cancel. Fewer digits then suffice.
+    # Subtract with 50 digits, because leading digits cancel. After the subtraction, float64 is
+    # accurate enough.
     parts = [float(e - v) for v, e in zip(values[:head].tolist(), exact, strict=True)]
     if case.copies:
         pattern = np.array([float(v) for v in weighted_sum(expected.weights, case.exact_pattern)])
@@ -177,7 +187,7 @@ def distance(case: Case, found: Tensor, expected: Answer) -> float:
 
 
 def one_sign(case: Case, found: Tensor) -> float:
-    """Return the distance from the nearest sums of elements with one sign, as GradDrop allows."""
+    """Return the distance to the nearest sums of elements with equal sign, as in GradDrop."""
     values = found.detach().double().numpy()
     head = case.head.shape[1]
     parts = [_to_nearest_sign(case.exact_head, values[None, :head])]

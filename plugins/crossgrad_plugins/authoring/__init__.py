@@ -1,1 +1,1 @@
-"""Commands for authors and users of plugins: lists, descriptions, contract checks, new packages."""
+"""Commands for authors and users of plugins: list, describe, check and create plugins."""

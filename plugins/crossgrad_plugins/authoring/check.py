@@ -28,7 +28,7 @@ def check_package(package: str) -> tuple[str, bool]:
         package: Name of a distribution, or of an import package that holds plugins.
 
     Returns:
-        The report in 80 columns, and whether every check passed.
+        The report in 80 columns, and True if every check passed.
 
     Raises:
         UserError: No such package is installed, or it offers no plugin.
@@ -63,7 +63,7 @@ def entries_of(package: str) -> list[Entry]:
     """Return the plugins of a package by slot and name.
 
     Raises:
-        UserError: For the reasons of `check_package`.
+        UserError: The same conditions as in `check_package`.
     """
     offered = [entry for slot in OFFERED for entry in offers(slot)]
     plugins = [entry for entry in offered if package in _names_of(entry)]

@@ -47,7 +47,7 @@ PackageArgument = Annotated[
 
 @app.callback(invoke_without_command=True)
 def plugins(context: typer.Context) -> None:
-    """List, explain, check and create plugins. Without a command: list."""
+    """List, explain, check and create plugins. Without a command, list the plugins."""
     if context.invoked_subcommand is None:
         list_plugins(None)
 
@@ -124,8 +124,9 @@ def matrix(
     """Train a package's components with all others for a few steps.
 
     Each combination of installed components trains a tiny scene twice. Losses and parameters must
-    be finite, and both runs must be equal. A combination that is refused before training, with a
-    reason, does not count as a failure. Exit status: 0 if all other combinations train, else 1.
+    be finite, and both trainings must give equal results. A combination that is refused before
+    training, with a reason, does not count as a failure. Exit status: 0 if every combination trains
+    or is refused, else 1.
     """
     announce()
     from crossgrad_plugins.authoring.matrix.report import train_matrix, train_one

@@ -1,4 +1,7 @@
-"""The description of a plugin: docstring, options, bounds, origin. The plugin is imported."""
+"""The description of a plugin: docstring, options, bounds, origin.
+
+The plugin is imported for the description.
+"""
 
 import inspect
 import json
@@ -24,11 +27,11 @@ if TYPE_CHECKING:
 
 _WIDTH = 80
 _MARGIN = "  "
-#: Sections of docstrings that are not for users. Options and their bounds are listed separately.
+#: Sections of docstrings that are written for developers and not for users.
 _SECTIONS = ("Attributes:", "Args:", "Returns:", "Raises:")
 _SIGNS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<", "multiple_of": "a multiple of"}
 _LENGTHS = {"min_length": "at least", "max_length": "at most"}
-#: Class attributes that describe requirements and results of a component -> label.
+#: Class attributes with the requirements and results of a component -> label in the description.
 _TRAITS = {
     "views": "views per step",
     "default_views": "default views",
@@ -65,14 +68,17 @@ def _heading(entry: Entry) -> str:
 
 
 def _described_command(entry: Entry) -> str:
-    """Describe a command; its options are described by its own help."""
+    """Describe a command.
+
+    Its options are described by its own help text.
+    """
     load_command(entry)
     hint = f"`crossgrad {entry.name} --help` explains its options"
     return "\n\n".join([_heading(entry), indent(_prose(f"{summary(entry)}\n\n{hint}"), _MARGIN)])
 
 
 def _prose(docstring: str) -> str:
-    """Wrap a docstring without the sections for readers of the code."""
+    """Wrap a docstring, but leave out the sections for developers."""
     blocks = [block for block in docstring.split("\n\n") if not block.startswith(_SECTIONS)]
     return "\n\n".join(_filled(block) for block in blocks)
 
@@ -93,7 +99,7 @@ def _traits(component: "type[Component]") -> list[tuple[str, object]]:
         if attribute not in component.model_fields and hasattr(component, attribute):
             value = getattr(component, attribute)
             if isinstance(value, property):
-                continue  # The value depends on the options.
+                continue
             value = sorted(value) if isinstance(value, frozenset) else value
             if value:
                 traits.append((label, listed(value) if isinstance(value, list | tuple) else value))

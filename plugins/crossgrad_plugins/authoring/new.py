@@ -20,7 +20,7 @@ from crossgrad_core.commands import (
     with_article,
 )
 
-#: Possible folders of the example package: first in the wheel, then in the checkout.
+#: Possible folders of the example package: in an installed wheel, and in a checkout.
 _EXAMPLES: Final = (
     Path(__file__).with_name("example"),
     Path(__file__).parents[3] / "examples" / "plugin",
@@ -64,7 +64,7 @@ def test_contract(check):
 
 @cache
 def examples() -> dict[str, tuple[Path, str]]:
-    """Return for each slot the module and the member of its plugin in the example package."""
+    """Return for each slot the module and the class or function of its example plugin."""
     folder = next(folder for folder in _EXAMPLES if folder.is_dir())
     project = tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     slots = {group: slot for slot, group in OFFERED.items()}
@@ -82,10 +82,10 @@ def write_package(name: str, slot: str, folder: Path) -> tuple[Path, ...]:
     Args:
         name: Name of the plugin and of the package.
         slot: The slot, one of `OFFERED`.
-        folder: Output folder; it is created here.
+        folder: Output folder, which this function creates.
 
     Returns:
-        The files.
+        The paths of the written files.
 
     Raises:
         UserError: The name is invalid or already used, or the folder is not empty.
@@ -102,7 +102,7 @@ def write_package(name: str, slot: str, folder: Path) -> tuple[Path, ...]:
 
 
 def _contents(name: str, module: str, slot: str) -> dict[str, str]:
-    """Return the text of each file, by its path below the folder."""
+    """Return the text of each file; keys are paths relative to the output folder."""
     kind = "".join(word.capitalize() for word in name.split("-"))
     member = module if slot == COMMANDS else kind
     example, model = examples()[slot]
@@ -122,7 +122,7 @@ def _contents(name: str, module: str, slot: str) -> dict[str, str]:
     }
     return {
         "pyproject.toml": _PROJECT.format(**words),
-        # The random generator of a rule has the name under which the rule is installed.
+        # A rule's random generator has the rule's entry-point name.
         f"{module}.py": re.sub(rf"\b{model}\b", member, source).replace(
             f'rngs["{example.stem}"]', f'rngs["{name}"]'
         ),

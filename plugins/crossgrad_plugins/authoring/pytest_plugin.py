@@ -1,7 +1,7 @@
 """`pytest --crossgrad-matrix PACKAGE`: the combinations of a package as tests.
 
-pytest imports this module in every run of an environment with crossgrad. No other module is
-imported unless the option is given.
+pytest imports this module in every run of an environment with crossgrad. To keep this import fast,
+other modules are imported only if the option is given.
 """
 
 from collections.abc import Callable, Iterator
@@ -107,5 +107,5 @@ class Combination(pytest.Item):
 
     @override
     def reportinfo(self) -> tuple[str, None, str]:
-        """Return the location of the test, which is not in a file."""
+        """Return the location that pytest reports, because the test has no source file."""
         return NAME, None, self.name

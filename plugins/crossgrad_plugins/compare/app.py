@@ -52,12 +52,12 @@ _MOST_SHOWN: Final = 3
 
 
 def differing_code(arms: Mapping[str, Runs]) -> list[str]:
-    """Return a note if arms, or the two runs of a pair, come from different commits or versions.
+    """Return a note if arms, or the runs of a pair, come from different commits or versions.
 
     A run without a recorded commit or version is ignored.
 
     Args:
-        arms: Arm -> scene and seed -> the run that represents both.
+        arms: Arm -> scene and seed -> the run that represents the scene and seed in this arm.
     """
     used = {arm: _all_code(runs) for arm, runs in arms.items()}
     groups: dict[str, list[str]] = {}
@@ -107,12 +107,12 @@ def _unlike_pairs(arms: Mapping[str, Runs]) -> Iterator[tuple[Run, Run]]:
 
 
 _TEMPLATE: Final = Path(__file__).with_name("page.html")
-#: Number of table rows that are visible. A click shows further rows.
+#: Number of table rows that are visible when the page opens. A click shows the other rows.
 _OPEN_ROWS: Final = 12
-#: Series colours on a dark page: the same hues, lighter.
+#: Colours of the arms on a dark page: equal hues, but lighter.
 _DARK: Final = ("#4fa8e0", "#f08a3c", "#2fc79b", "#e3a1c5", "#f0b93a", "#86c9f2", "#c2a04a")
 _WORST_NAMED: Final = 8
-#: Field of a run's environment (machine, code) -> text that precedes its value.
+#: Field of a run's environment (machine, code) -> text before its value on the page.
 _MACHINE: Final = {
     "cpu": "",
     "cpu_cores": "cores: ",
@@ -137,9 +137,9 @@ def page_of(
     Args:
         comparison: The comparison.
         figures: All figures that could be drawn, in order.
-        pictured: The views that are shown with pictures.
+        pictured: The held-out views for which the page shows pictures.
         views: Scene -> all held-out views, the worst first.
-        notes: Results that are not compared or shown, with the reason.
+        notes: Notes on results that are not compared or not shown, with the reasons.
         version: Version of crossgrad.
     """
     from jinja2 import Environment, StrictUndefined
@@ -255,8 +255,8 @@ def compare(
     """Compare runs, write the page, figures and tables to a folder, and print the verdicts.
 
     Args:
-        places: Folders of runs, or folders with runs below.
-        options: How to compare.
+        places: Folders of runs, or folders that contain such folders.
+        options: Options of the comparison.
         out: Output folder; by default `compare` next to the runs.
         skip_broken: True to leave out runs with damaged files.
 

@@ -9,8 +9,7 @@ from typing import Final, TypeAlias
 from crossgrad_core.commands import UserError
 from crossgrad_plugins.compare.run import ABSENT, Run, Settings, text_of
 
-#: Settings that come first in the names of arms, if they differ between the arms. Other settings
-#: follow.
+#: Settings that come first in the names of arms, if their values differ between the arms.
 _FIRST: Final = (
     *("backbone", "views_per_step", "sampler", "operator", "densifier"),
     *("rate_factor", "densify_views", "schedule", "schedule_length", "schedule_unit"),
@@ -19,7 +18,7 @@ _FIRST: Final = (
 #: Settings that have a shorter name in the names of arms.
 _SPOKEN: Final = {"views_per_step": "views"}
 _DIGITS: Final = re.compile(r"(\d+)")
-#: Name of a scene, and seed.
+#: Name of a scene, and a seed.
 Problem: TypeAlias = tuple[str, int]
 Length: TypeAlias = tuple[str, float]
 
@@ -32,7 +31,7 @@ class Arm:
         name: Name of the arm.
         runs: The finished runs of the arm, of any length.
         failed: The failed runs of the arm.
-        settings: Setting -> value, for the settings in which arms differ.
+        settings: Setting -> value of this arm, for all settings whose values differ between arms.
     """
 
     name: str
@@ -44,11 +43,11 @@ class Arm:
 def arms_of(runs: Sequence[Run], failed: Sequence[Run] = ()) -> tuple[Arm, ...]:
     """Group runs into arms; return the arms in the order of their names.
 
-    An arm contains the runs that agree in every setting that varies within a scene. A setting that
-    differs only between scenes, such as a degree that the data of a scene cannot support, does not
-    separate arms. If every run has a label of a sweep, the runs with the same label form an arm. If
-    a label covers several configurations on one scene, for instance after two sweeps, the settings
-    of the runs separate the configurations.
+    The runs of an arm agree in every setting whose values differ within a scene. If a setting
+    differs only between scenes, it does not separate arms. An example is an SH degree that the data
+    of a scene cannot support. If every run has a label from a sweep, runs with equal labels form an
+    arm. If a label covers several configurations on one scene, for example after two sweeps, the
+    settings separate these configurations.
 
     Args:
         runs: The finished runs; at least one.
@@ -75,7 +74,7 @@ def _grouped(runs: Sequence[Run]) -> list[tuple[str, list[Run]]]:
         arms = _by_labels(runs)
         if len({name for name, _ in arms}) == len(arms):
             return arms
-    # Keep a run only once, because a run with two labels is listed twice.
+    # A run with two labels is listed twice, so keep it only once.
     return _by_settings(list({run.name: run for run in runs}.values()))
 
 
@@ -109,7 +108,7 @@ def renamed(arms: Sequence[Arm], names: Sequence[str]) -> tuple[Arm, ...]:
 
     Args:
         arms: The arms.
-        names: `OLD:NEW` texts.
+        names: Texts `OLD:NEW`.
 
     Raises:
         UserError: A text names no existing arm, or two arms would have the same name.
@@ -138,11 +137,10 @@ def renamed(arms: Sequence[Arm], names: Sequence[str]) -> tuple[Arm, ...]:
 
 
 def _varying(runs: Iterable[Run]) -> tuple[str, ...]:
-    """Return the settings with several values within a scene, the most important settings first.
+    """Return the settings that have several values within a scene, most important first.
 
-    A setting that only some runs have is ignored. Such a setting either belongs to another version,
-    or is an option of a component that only some runs use; the component itself then distinguishes
-    the arms.
+    A setting that is missing in some runs is ignored. It either belongs to another version, or is
+    an option of a component that only some runs use. The component's name then separates the runs.
     """
     seen: dict[tuple[str, str], set[str]] = {}
     for run in runs:
@@ -171,7 +169,7 @@ def _names(
 
 
 def _name(keys: Sequence[str], values: tuple[str, ...], chosen: Sequence[int]) -> str:
-    """Return the chosen settings as a name; options of absent components are left out."""
+    """Return the chosen settings as a name, without options of components that are not used."""
     present = [index for index in chosen if values[index] != ABSENT]
     return ", ".join(_part(keys[index], values[index]) for index in present or chosen)
 
@@ -203,7 +201,7 @@ class Cells:
 
     Attributes:
         runs: Arm -> scene and seed -> length -> run.
-        repetitions: Folder of a repeated run -> folder of the run that is used instead.
+        repetitions: Folder of a repeated run -> folder of the run that replaces it.
     """
 
     runs: Mapping[str, Mapping[Problem, Mapping[Length, Run]]]
@@ -229,23 +227,23 @@ class Cells:
 
     @property
     def several(self) -> bool:
-        """True if an arm has runs of several lengths for one scene and seed."""
+        """True if an arm has runs of several lengths for a scene and a seed."""
         return any(len(by) > 1 for problems in self.runs.values() for by in problems.values())
 
     def at(self, length: Length) -> dict[str, dict[Problem, Run]]:
-        """Return the runs of the given length, by arm, and then by scene and seed."""
+        """Return the runs of a length: arm -> scene and seed -> run."""
         return {
             arm: {problem: by[length] for problem, by in problems.items() if length in by}
             for arm, problems in self.runs.items()
         }
 
     def main(self) -> dict[str, dict[Problem, Run]]:
-        """Return the runs that represent each scene and seed, by arm, and then by scene and seed.
+        """Return the runs that represent each scene and seed: arm -> scene and seed -> run.
 
-        The run has the length that is most frequent on its scene; of two equally frequent lengths,
-        the longer one is used. An arm uses another length on a scene if it has more than twice as
-        many runs of that other length there. An arm without a run of the most frequent length uses
-        its own lengths; the longest run represents each scene and seed.
+        A scene is represented by the runs of its most frequent length. Of two equally frequent
+        lengths, the longer one is used. An arm uses another length on a scene if it has more than
+        twice as many runs of this length there. If an arm has no run of the most frequent length,
+        its longest run represents each scene and seed.
         """
         chosen = self._chosen()
         return {
@@ -259,7 +257,7 @@ class Cells:
 
     @property
     def unlike(self) -> dict[str, str]:
-        """Name of a run -> why it is not used, although no other run of its arm replaces it."""
+        """Name of a run -> why the run is not used, if no other run of its arm replaces it."""
         chosen = self._chosen()
         return {
             run.name: (
@@ -274,7 +272,7 @@ class Cells:
     def _chosen(self) -> dict[tuple[str, str], Length]:
         """Return the length that is used for each arm and scene.
 
-        An arm without a run of the usual length has no entry.
+        An arm without a run of the most frequent length has no entry.
         """
         scene_counts: dict[str, Counter[Length]] = {}
         arm_counts: dict[tuple[str, str], Counter[Length]] = {}
@@ -305,6 +303,6 @@ def _amount(length: Length) -> float:
 
 
 def _preferred(counts: Mapping[Length, int], usual_length: Length) -> Length:
-    """Return the usual length, or a length that occurs more than twice as often."""
+    """Return the most frequent length, or one with more than twice as many runs in this arm."""
     most_common = max(counts, key=lambda length: (counts[length], _amount(length)))
     return most_common if counts[most_common] > 2 * counts[usual_length] else usual_length

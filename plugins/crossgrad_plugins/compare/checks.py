@@ -15,35 +15,36 @@ from crossgrad_plugins.compare.quantity import (
 )
 from crossgrad_plugins.compare.run import Run
 
-#: Pattern of the note on the photos' sizes that every run writes.
+#: Pattern of the note about photo sizes that every run writes.
 _SIZES: Final = re.compile(r"^photos: (?P<sizes>\d.*?) from .*?/, (?P<how>.*)$")
 _MOST_SHOWN: Final = 3
-#: Key of the definition that applies to every metric, because it says how renders are compared.
+#: Key of the definition of how renders are compared; this definition applies to every metric.
 _RENDERS: Final = "renders"
-#: The environment fields that identify a machine. The fields in `_SHARE` describe how much of the
-#: machine is used.
+#: The environment fields that identify a machine. The fields in `_SHARE` give the part of the
+#: machine that a run may use.
 _MACHINE: Final = {"cpu": "processor", "gpu": "GPU", "device": "device"}
 _SHARE: Final = {"cpu_cores": "number of cores", "torch_threads": "number of threads"}
-#: Allowed relative difference of the calibration rates: by wall clock, and in CPU time. CPU time
-#: varies more than wall-clock time, because other processes share the caches and cores.
+#: Maximum relative difference between the measured speeds of machines: in wall-clock time, and in
+#: CPU time. CPU time varies more than wall-clock time, because other processes share the caches and
+#: cores.
 _SAME_SPEED: Final = {"rate": 0.1, "cpu_rate": 0.25}
-#: A machine counts as busy if its mean load exceeds its number of cores by this amount.
+#: A machine counts as busy if its mean load is above its number of cores plus this value.
 _BUSY: Final = 0.5
-#: Name of wall-clock seconds in notes. CPU seconds can be compared even if wall-clock seconds
-#: cannot.
+#: Name of wall-clock seconds in notes. CPU seconds may be comparable even if wall-clock seconds are
+#: not.
 _CLOCK: Final = "wall-clock seconds"
 _NEVER_RECORDED: Final = "no run recorded them"
 
 
 def check_scenes(runs: Sequence[Run]) -> list[str]:
-    """Refuse runs of one scene that differ in split, photos, sizes or resize filter.
+    """Refuse runs of a scene that differ in split, photos, photo sizes or resize filter.
 
     Returns:
-        Notes about two limits: runs whose photos cannot be compared, and scenes whose regimes
-            differ. For these scenes only overall metrics are compared.
+        Notes about runs whose photos cannot be checked, and about scenes whose regimes differ. For
+        scenes with different regimes, only overall metrics are compared.
 
     Raises:
-        UserError: The metrics of these runs are not comparable; the message states the reason.
+        UserError: The metrics of the runs are not comparable; the message gives the reason.
     """
     for scene in dict.fromkeys(run.scene for run in runs):
         on_scene = [run for run in runs if run.scene == scene]
@@ -64,7 +65,7 @@ def check_scenes(runs: Sequence[Run]) -> list[str]:
 
 
 def differing_regimes(runs: Sequence[Run]) -> tuple[str, ...]:
-    """Return the scenes whose runs assign different regimes to the same held-out views."""
+    """Return the scenes for which runs assign different regimes to a held-out view."""
     seen: dict[str, set[Hashable]] = {}
     for run in runs:
         labels = frozenset((view.name, view.regime) for view in run.results.views)
@@ -125,7 +126,7 @@ def _check_trained(scene: str, runs: Sequence[Run]) -> None:
 
 
 def _odd_one(runs: Sequence[Run], mark: Callable[[Run], Hashable]) -> tuple[Run, Run] | None:
-    """Return the first run, and the first run whose mark differs from it, or None."""
+    """Return the first run and the first run whose value differs from it; None if all agree."""
     return next(((runs[0], run) for run in runs if mark(run) != mark(runs[0])), None)
 
 
@@ -148,12 +149,12 @@ def _photos(run: Run) -> str:
 
 
 def _mark(file: object) -> object:
-    """Return the size and digest that identify a file; other values are returned unchanged."""
+    """Return the size and digest of a file entry; return any other value unchanged."""
     return [file.get("bytes"), file.get("sha256")] if isinstance(file, dict) else file
 
 
 def _sizes(run: Run) -> str:
-    """Return photo sizes and resize filter from a run's notes; empty without such a note."""
+    """Return photo sizes and resize filter from a run's notes, or nothing if there is no note."""
     for note in run.summary.get("notes") or ():
         if match := _SIZES.match(str(note)):
             return f"{match['sizes']}, {match['how']}"
@@ -172,7 +173,7 @@ def _difference(first: frozenset[str], second: frozenset[str]) -> str:
 def quantities_of(
     runs: Sequence[Run], name: str, margin: float | None
 ) -> tuple[tuple[Quantity, ...], list[str]]:
-    """Return the metrics that can be compared, the main metric first, and notes about all others.
+    """Return the comparable metrics, main metric first, and notes about the other metrics.
 
     Args:
         runs: The runs.
@@ -180,8 +181,8 @@ def quantities_of(
         margin: Margin of the main metric; None for the default margin.
 
     Raises:
-        UserError: No run has the main metric, or the runs differ in its definition or in the rules
-            by which renders are compared.
+        UserError: No run has the main metric, or the runs differ in the definition of the metric or
+            of how renders are compared.
     """
     offered = dict.fromkeys(key for run in runs for key in _overall(run) if key != "views")
     measured = [key for key in offered if any(run.final(key) is not None for run in runs)]
@@ -237,7 +238,7 @@ def _check_definition(runs: Sequence[Run], key: str) -> None:
 
 
 def _definitions(runs: Sequence[Run], key: str) -> dict[str, str]:
-    """Return the first run that states each definition; runs without a definition are ignored."""
+    """Return the first run with each definition; runs without a definition are ignored."""
     definitions: dict[str, str] = {}
     for run in runs:
         text = (run.summary.get("definitions") or {}).get(key)
@@ -255,10 +256,11 @@ def comparable_costs(runs: Sequence[Run], clock: ClockChoice) -> tuple[tuple[Cos
 
     Args:
         runs: The runs.
-        clock: The seconds to compare. `auto` uses every clock whose seconds are comparable.
+        clock: Which seconds are compared: wall-clock, CPU or `auto`. With `auto`, every kind of
+            seconds that is comparable is used.
 
     Raises:
-        UserError: The requested seconds are not comparable; the message states the reason.
+        UserError: The requested seconds are not comparable; the message gives the reason.
     """
     reasons = {SECONDS: _why_no_wall(runs), CPU_SECONDS: _why_no_cpu(runs)}
     wanted = {ClockChoice.WALL: SECONDS, ClockChoice.CPU: CPU_SECONDS}.get(clock)
@@ -282,7 +284,7 @@ def comparable_costs(runs: Sequence[Run], clock: ClockChoice) -> tuple[tuple[Cos
 
 
 def _why_no_wall(runs: Sequence[Run]) -> str:
-    """Return why wall-clock seconds are not comparable; empty if they are."""
+    """Return why wall-clock seconds are not comparable, or an empty text if they are."""
     return (
         _other_machine(runs, {**_MACHINE, **_SHARE})
         or _busy(runs)
@@ -311,7 +313,7 @@ def _other_machine(runs: Sequence[Run], fields: dict[str, str]) -> str:
 
 
 def _other_speed(runs: Sequence[Run], name: str) -> str:
-    """Return how the calibrated speed of the machine differs between runs; empty if it is equal."""
+    """Return how the measured machine speed differs between runs; empty if it does not."""
     speeds = [(run.number("environment", "calibration", name), run) for run in runs]
     rates = [(rate, run) for rate, run in speeds if rate is not None]
     if len(rates) < len(runs):
@@ -344,9 +346,9 @@ def _busy(runs: Sequence[Run]) -> str:
 
 
 def _threads(runs: Sequence[Run]) -> str:
-    """Return the reason why threads make CPU seconds incomparable; empty without such a reason.
+    """Return why different thread counts make CPU seconds incomparable, or an empty text.
 
-    Waiting threads spin: they use CPU seconds without doing any work.
+    Threads that wait in a loop use CPU seconds without doing work.
     """
     for run in runs:
         threads = run.number("environment", "torch_threads")

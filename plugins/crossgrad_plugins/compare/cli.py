@@ -8,8 +8,8 @@ from crossgrad_plugins.compare.options import Command
 def compare(options: Command) -> None:
     """Compare runs: quality with confidence intervals, and costs.
 
-    Groups runs into arms by the settings that differ, pairs them by scene and seed, and writes one
-    page, figures for a paper and CSV tables. Runs that cannot be compared are refused.
+    Runs are grouped into arms by the settings that differ. Arms are paired by scene and seed. The
+    output is a page, figures for a paper, and CSV tables. Runs that cannot be compared are refused.
     """
     announce()
     from crossgrad_plugins.compare import app

@@ -1,4 +1,4 @@
-"""The results of a comparison, which figures, tables and texts show."""
+"""The results of a comparison, for figures, tables and texts."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,28 +22,31 @@ from crossgrad_plugins.compare.ranking import Standing
 from crossgrad_plugins.compare.run import Run
 from crossgrad_plugins.compare.targets import is_inside, shared_amount, value_at
 
-#: The main table compares the arms at this position: the end of the runs.
+#: The main table compares the runs at their ends.
 END = "at the end"
 OVERALL = "overall"
-#: With at most this many arms, every table has a row for every pair of arms.
+#: With at most this many arms, every table contains all pairs of arms.
 _FEW_ARMS = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Comparable runs and their results; each result is computed at first use.
+    """Comparable runs and their results.
+
+    Each result is computed when it is first used.
 
     Attributes:
         arms: The arms in the order of their names.
-        baseline: The arm that all other arms are compared with; None compares all arms with each
-            other.
+        baseline: The arm with which all other arms are compared; if None, all arms are compared
+            with each other.
         quantities: The metrics that are compared, the main metric first.
         costs: The costs that can be compared.
         cells: All runs by arm, scene, seed and length.
         unlike: Scenes whose runs assign different regimes to the same held-out views.
-        target: The quality to reach; None for the final quality of the weakest arm, by scene.
+        target: The quality to reach; None means the median final quality of the weakest arm on each
+            scene.
         checked: Notes of the checks about results that are not compared, with the reasons.
-        unused: Folder of an unfinished or unreadable run -> why the run is left out.
+        unused: Folder of an unfinished or unreadable run -> reason why the run is left out.
     """
 
     arms: tuple[Arm, ...]
@@ -63,7 +66,7 @@ class Comparison:
 
     @cached_property
     def main(self) -> Mapping[str, Runs]:
-        """Arm -> scene and seed -> the run that represents them."""
+        """Arm -> scene and seed -> the run that represents this scene and seed."""
         return self.cells.main()
 
     @cached_property
@@ -73,12 +76,12 @@ class Comparison:
 
     @cached_property
     def runs(self) -> tuple[Run, ...]:
-        """The runs that represent an arm, a scene and a seed."""
+        """The runs that represent an arm on a scene with a seed."""
         return tuple(run for by in self.main.values() for run in by.values())
 
     @cached_property
     def standing(self) -> Mapping[str, Mapping[str, Standing]]:
-        """Arm -> scene -> the main metric at the end of the runs."""
+        """Arm -> scene -> the main metric at the ends of the runs."""
         return ranking.standings(self.main, self.quantity)
 
     @cached_property
@@ -98,19 +101,19 @@ class Comparison:
 
     @cached_property
     def left_out(self) -> Mapping[str, str]:
-        """Folder -> why the folder is left out."""
+        """Folder -> reason why the folder is left out."""
         repeated = {name: f"repeats {kept}" for name, kept in self.cells.repetitions.items()}
         return {**self.unused, **repeated, **self.cells.unlike}
 
     @cached_property
     def ends(self) -> tuple[Contrast, ...]:
-        """The contrast of each pair of arms at the ends of the runs."""
+        """The contrast of each pair of arms at the ends of their runs."""
         couples = pairwise.couples(self.ranking, self.baseline)
         return pairwise.judged(self._at_end(couple, self.quantity) for couple in couples)
 
     @cached_property
     def others(self) -> tuple[Contrast, ...]:
-        """The contrasts of the main pairs of arms, for all metrics except the main metric."""
+        """The contrasts of the compared pairs of arms, for all metrics except the main metric."""
         return pairwise.judged(
             self._at_end(couple, quantity)
             for quantity in self.quantities[1:]
@@ -119,7 +122,7 @@ class Comparison:
 
     @cached_property
     def equal(self) -> tuple[Contrast, ...]:
-        """The contrasts of the main pairs of arms at equal cost, if costs differ at the ends."""
+        """The contrasts of the compared pairs at equal cost, if the final costs differ."""
         contrasts = [self._at_cost(couple, cost) for couple in self._telling for cost in self.costs]
         return pairwise.judged(contrast for contrast in contrasts if contrast.inside)
 
@@ -135,7 +138,10 @@ class Comparison:
 
     @cached_property
     def regimes(self) -> tuple[Contrast, ...]:
-        """The contrasts of the main pairs, overall and by regime, on scenes with agreed regimes."""
+        """The contrasts of the compared pairs, overall and by regime.
+
+        Scenes without agreed regimes are left out.
+        """
         regime_lists = (run.results.regimes for run in self.runs if run.scene not in self.unlike)
         names = sorted({regime for regimes in regime_lists for regime in regimes})
         if len(names) < 2:  # noqa: PLR2004 - a single regime would repeat `overall`
@@ -158,7 +164,7 @@ class Comparison:
 
     @cached_property
     def points(self) -> tuple[frontier.Point, ...]:
-        """Final quality over length."""
+        """The final quality of runs by length."""
         return frontier.points(self.cells, self.quantity, self.costs)
 
     @cached_property
@@ -168,9 +174,9 @@ class Comparison:
 
     @cached_property
     def _telling(self) -> list[tuple[str, str]]:
-        """The pairs of arms that every table shows.
+        """The pairs of arms that every table contains.
 
-        With many arms, these are only the pairs of the best arm.
+        If there are many arms, only pairs with the best arm are contained.
         """
         couples = pairwise.couples(self.ranking, self.baseline)
         few = self.baseline is not None or len(self.arms) <= _FEW_ARMS
@@ -216,7 +222,7 @@ def compared(found: RunRecord, options: Options) -> Comparison:
     """Check runs and compare them.
 
     Raises:
-        UserError: No run has finished, or the runs are not comparable; the message states the
+        UserError: No run has finished, or the runs are not comparable; the message gives the
             reason.
     """
     if not found.runs:
@@ -257,7 +263,7 @@ def _check_baseline(arms: Sequence[Arm], baseline: str | None) -> None:
 
 
 def _without(main: Mapping[str, Runs], quantity: Quantity) -> list[str]:
-    """Return notes on runs that have no metric value at their ends."""
+    """Return notes about runs that have no metric value at their ends."""
     notes = []
     for run in {run.name: run for by in main.values() for run in by.values()}.values():
         if run.final(quantity.name) is None:

@@ -16,9 +16,9 @@ from crossgrad_plugins.compare.statistics import (
     verdicts,
 )
 
-#: Function that maps a run to its value, or to None if the run has no value.
+#: Function that returns the value of a run, or None if the run has no value.
 Reading: TypeAlias = Callable[[Run], float | None]
-#: Scene and seed -> run of one arm.
+#: Scene and seed -> the run of an arm.
 Runs: TypeAlias = Mapping[Problem, Run]
 
 
@@ -39,17 +39,18 @@ class Pair:
 
 @dataclass(frozen=True)
 class Contrast:
-    """The comparison of one arm with another.
+    """The difference between two arms, with its uncertainty and verdict.
 
     Attributes:
         first: Name of the first arm.
         second: Name of the second arm.
-        where: The point or the views of the comparison, such as `at the end` or a regime.
+        where: The point or the views of the comparison, such as `at the end`, or the name of a
+            regime.
         quantity: The metric that is compared.
         pairs: The pairs of runs.
         estimate: The value of the first arm minus the value of the second arm; None without a pair.
-        verdict: The verdict, which takes the other contrasts of its table into account.
-        inside: True if runs were read before their ends, while their schedules continued.
+        verdict: The verdict, corrected for the number of contrasts in the table.
+        inside: True if runs were compared at a point before their ends.
     """
 
     first: str
@@ -74,12 +75,12 @@ class Contrast:
 
     @property
     def is_small(self) -> bool:
-        """True if the 90 % interval is inside the margin, for any verdict."""
+        """True if the 90 % interval is inside the margin; the verdict is not used."""
         return self.estimate is not None and self.estimate.is_small
 
     @property
     def differs(self) -> bool:
-        """True if the 95 % interval excludes zero, without regard to other comparisons."""
+        """True if the 95 % interval excludes zero; other comparisons are not taken into account."""
         return self.estimate is not None and self.estimate.differs
 
     @property
@@ -97,7 +98,7 @@ def contrast(
     reading: Reading,
     where: str,
 ) -> Contrast:
-    """Compare one arm with another; leave out pairs in which a run has no value."""
+    """Compare one arm with another; pairs in which a run has no value are left out."""
     first, second = runs
     pairs = []
     for scene, seed in sorted(first.keys() & second.keys()):
@@ -112,7 +113,7 @@ def contrast(
 
 
 def judged(contrasts: Iterable[Contrast]) -> tuple[Contrast, ...]:
-    """Return the contrasts of one table with verdicts; contrasts without a pair are left out."""
+    """Return the contrasts of a table with verdicts, without contrasts that have no pair."""
     family = [row for row in contrasts if row.estimate is not None]
     judgements = verdicts([row.estimate for row in family if row.estimate is not None])
     return tuple(replace(c, verdict=verdict) for c, verdict in zip(family, judgements, strict=True))
@@ -121,7 +122,7 @@ def judged(contrasts: Iterable[Contrast]) -> tuple[Contrast, ...]:
 def couples(ranking: Sequence[str], baseline: str | None) -> list[tuple[str, str]]:
     """Return the pairs of arms to compare.
 
-    Each arm is compared with the baseline, or with every arm that is ranked below it.
+    Each arm is compared with the baseline; without a baseline, with every lower-ranked arm.
     """
     if baseline is not None:
         return [(name, baseline) for name in ranking if name != baseline]

@@ -1,4 +1,4 @@
-"""Final quality over the length of runs, and the gain of longer runs."""
+"""The final quality of runs by length, and the gain of longer runs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ class Point:
     Attributes:
         arm: The arm.
         scene: The scene.
-        length: Budget of the runs as text.
+        length: Budget of the runs, as text.
         spent: Cost -> mean amount that the runs spent.
         mean: Mean of the final metric.
         spread: Standard deviation of the final metric over seeds; NaN for one run.
@@ -36,7 +36,7 @@ class Point:
 
 
 def points(cells: Cells, quantity: Quantity, costs: Sequence[Cost]) -> tuple[Point, ...]:
-    """Return all points, ordered from short to long runs."""
+    """Return all points, from short to long runs."""
     all_points = []
     for length in cells.lengths:
         runs = cells.at(length)
@@ -57,7 +57,7 @@ def points(cells: Cells, quantity: Quantity, costs: Sequence[Cost]) -> tuple[Poi
 
 
 def gains(cells: Cells, quantity: Quantity) -> tuple[Contrast, ...]:
-    """Compare, within each arm, runs of one length with runs of the next shorter length."""
+    """Compare the runs of each length with the next shorter runs of the same arm."""
     contrasts = []
     for arm in cells.runs:
         lengths = [length for length in cells.lengths if cells.at(length)[arm]]

@@ -1,4 +1,7 @@
-"""Reading runs from folders; broken and unfinished runs are left out or refused."""
+"""Read runs from folders.
+
+Broken and unfinished runs are left out or refused.
+"""
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,24 +25,24 @@ from crossgrad_plugins.compare.run import Run
 if TYPE_CHECKING:
     from crossgrad_core.commands import RunResults
 
-#: Name of the table of a sweep, which is next to the folder of the runs.
+#: Name of the table of a sweep; the table is in the folder that contains the folder of the runs.
 _PLAN: Final = "runs.csv"
 _ID, _LABEL = "run", "configuration"
 _LENGTHS: Final = ("steps=", "max_views=", "seconds=")
-#: Label of the only arm of a grid without arms.
+#: Label of a grid's arm if the grid has only one.
 _ONLY: Final = "run"
 _REPEAT: Final = "restore the file, or repeat the run: crossgrad run --config config.yaml"
 _OVERSIZED: Final = "a whole number that is too large"
 
 
 class _Seconds(BaseModel):
-    """The seconds of summary.json that are added up."""
+    """The seconds in summary.json that are added up."""
 
     phases: dict[str, Annotated[float, Field(strict=True, allow_inf_nan=False)]] | None = None
 
 
 class _Summary(BaseModel):
-    """The part of summary.json that a comparison requires."""
+    """The entries of summary.json that a comparison needs."""
 
     status: str
     scene: str
@@ -59,7 +62,7 @@ class RunRecord:
     Attributes:
         runs: The finished runs.
         failed: The failed runs, which never reach a quality.
-        left_out: Folder -> why it is not compared.
+        left_out: Folder -> reason why it is not compared.
     """
 
     runs: list[Run] = field(default_factory=list)
@@ -68,10 +71,10 @@ class RunRecord:
 
 
 def read_runs(places: Sequence[Path], *, skip_broken: bool) -> RunRecord:
-    """Read every run in or below the given folders, each run once.
+    """Read every run in the given folders or below; each run is read once.
 
     Args:
-        places: Folders of runs, or folders with runs below.
+        places: Folders of runs, or folders that contain such folders.
         skip_broken: True to leave out a run with a damaged file instead of raising an error.
 
     Raises:
@@ -132,7 +135,7 @@ def _no_run(path: Path) -> UserError:
 
 
 def _headless(root: Path) -> Iterator[Path]:
-    """Yield folders in or below a folder that contain results of a run but not its config.yaml."""
+    """Yield folders that contain results of a run but not its config.yaml."""
     for path in sorted(root.rglob("summary.json")):
         folder = path.parent
         if (folder / "metrics.csv").exists() and not (folder / "config.yaml").exists():
@@ -168,13 +171,15 @@ def _sort_in(record: RunRecord, name: str, results: "RunResults", label: str | N
 
 
 def _check_whole(results: "RunResults") -> None:
-    """Refuse a finished run with a truncated or missing file, because its metrics would be wrong.
+    """Refuse a finished run with a truncated or missing file.
+
+    The metrics of such a run would be wrong.
 
     Raises:
-        UserError: metrics.csv ends before the end of the run or contains a number that is too
-            large, held-out views have no metrics, or scene.json cannot be read.
+        UserError: metrics.csv ends before the end of the run or contains too large a number,
+            held-out views have no metrics, or scene.json cannot be read.
     """
-    # This raises an error if scene.json is malformed.
+    # Read scene.json here, because this raises an error if the file is malformed.
     views = (results.scene_marks or {}).get("views") or {}
     if not all(isinstance(view, Mapping) for view in views.values()):
         raise UserError(
@@ -227,7 +232,7 @@ def _check_summary(results: "RunResults") -> None:
 
 
 def _oversized(content: object) -> bool:
-    """Return True if lists and objects contain a whole number that no float can represent."""
+    """Return True if a number in nested lists and objects is too large for a float."""
     rest = [content]
     while rest:
         item = rest.pop()
@@ -262,9 +267,9 @@ def _config(results: "RunResults") -> dict[str, object]:
 
 
 def _labels(folder: Path) -> dict[str, tuple[str, ...]]:
-    """Return the labels in the sweep by name of the run's folder; empty without a sweep.
+    """Return the labels of a sweep by name of the run's folder, or nothing without a sweep.
 
-    A run that belongs to two configurations has both labels.
+    A run that belongs to two configurations of the sweep has two labels.
     """
     plan = folder.parent / _PLAN
     if not plan.is_file():
@@ -285,7 +290,7 @@ def _labels(folder: Path) -> dict[str, tuple[str, ...]]:
 
 
 def without_length(label: str) -> str:
-    """Remove the length, and the name of a grid's single arm, from a label."""
+    """Remove from a label the length, and the name of a grid's only arm."""
     parts = [part for part in label.split(", ") if not part.startswith(_LENGTHS)]
     named = parts[1:] if parts[:1] == [_ONLY] else parts
     return ", ".join(named or parts)

@@ -1,4 +1,4 @@
-"""The results as sentences: the best arm, the difference, its certainty and its cost."""
+"""The results as sentences: the best arm, its difference, the certainty and the cost."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from crossgrad_plugins.compare.quantity import COSTS
 from crossgrad_plugins.compare.statistics import Verdict
 
 _TITLES = {cost.name: cost.title for cost in COSTS}
-#: Maximum number of arms that one sentence names.
+#: Maximum number of arms that a sentence names.
 _MOST_NAMED = 6
 _ONE_PAIR = "one pair does not show the noise: run more seeds"
 _NONE_BEATEN = "but it is not significantly better than any other arm"
@@ -40,7 +40,7 @@ def headline(comparison: Comparison) -> tuple[Sentence, ...]:
 
 
 def claim(contrast: Contrast) -> str:
-    """Return the statement about two arms."""
+    """Return the sentence about two arms."""
     estimate = contrast.estimate
     if estimate is None:
         return f"{contrast.first} and {contrast.second} have no scene with the same seed in common"
@@ -74,7 +74,7 @@ def opposed_text(contrast: Contrast) -> str:
 def where_text(contrast: Contrast) -> str:
     """Return the point or the views of a contrast.
 
-    A star marks runs that were compared before their ends.
+    A star marks runs that were compared at a point before their ends.
     """
     title = _TITLES.get(contrast.where)
     text = contrast.where if title is None else f"equal {title}"
@@ -82,13 +82,13 @@ def where_text(contrast: Contrast) -> str:
 
 
 def verdict_text(contrast: Contrast) -> str:
-    """Return the verdict, and the scenes whose own intervals contradict it."""
+    """Return the verdict, and the scenes whose own intervals contradict this verdict."""
     opposed = opposed_text(contrast)
     return f"{contrast.verdict}, {opposed}" if opposed else str(contrast.verdict)
 
 
 def support(contrast: Contrast) -> str:
-    """Return the evidence for the statement: interval, pairs and scenes."""
+    """Return the evidence for a statement: interval, pairs and scenes."""
     estimate = contrast.estimate
     if estimate is None:
         return ""
@@ -105,7 +105,7 @@ def support(contrast: Contrast) -> str:
 
 
 def needed_text(contrast: Contrast) -> str:
-    """Return how many pairs would settle the comparison."""
+    """Return how many pairs would be enough for a verdict."""
     estimate = contrast.estimate
     if estimate is None or estimate.pairs == 1:
         return _ONE_PAIR
@@ -159,7 +159,7 @@ def _alone(comparison: Comparison) -> Sentence:
 
 
 def _unpaired(comparison: Comparison) -> Sentence:
-    """Return the reason why several arms have no pair."""
+    """Return the reason why several arms have no pair of runs."""
     failed = [arm.name for arm in comparison.arms if arm.failed and not arm.runs]
     if failed:
         return Sentence(
@@ -178,9 +178,10 @@ def _unpaired(comparison: Comparison) -> Sentence:
 
 
 def _of_the_best(comparison: Comparison) -> list[Sentence]:
-    """Compare the arm with the best mean with the other arms.
+    """Compare the best arm with the other arms.
 
-    The best arm is chosen by its mean over runs. The estimate from pairs can differ from this mean.
+    The best arm is the arm with the best mean over its runs. The estimate from pairs of runs can
+    differ from the difference of these means.
     """
     leader = comparison.ranking[0]
     with_leader = [
@@ -219,7 +220,7 @@ def _against(contrasts: Sequence[Contrast]) -> str:
 
 
 def _named(texts: Iterable[str], separator: str = ", ") -> str:
-    """Return the first texts, and the number of further texts."""
+    """Return the first texts, and how many more there are."""
     every = list(texts)
     more = len(every) - _MOST_NAMED
     shown = separator.join(every[:_MOST_NAMED])
@@ -227,14 +228,14 @@ def _named(texts: Iterable[str], separator: str = ", ") -> str:
 
 
 def _why(contrasts: Sequence[Contrast]) -> str:
-    """Return why arms are equivalent, or the pairs needed for the arm hardest to distinguish."""
+    """Return why arms are equivalent, or how many pairs the closest arm would need."""
     if contrasts[0].verdict is Verdict.EQUIVALENT:
         return f"within {_margin(contrasts[0])}"
     return needed_text(max(contrasts, key=lambda c: (c.estimate and c.estimate.needed) or inf))
 
 
 def _lengths(comparison: Comparison) -> list[Sentence]:
-    """Return a sentence if runs of a scene and seed have different lengths in two arms."""
+    """Return a sentence if two arms have runs of different lengths for a scene and seed."""
     lengths: dict[str, dict[str, None]] = {}
     for problem in {problem for by in comparison.main.values() for problem in by}:
         by_arm = {n: by[problem].length_text for n, by in comparison.main.items() if problem in by}
@@ -252,7 +253,7 @@ def _lengths(comparison: Comparison) -> list[Sentence]:
 
 
 def _equal_costs(comparison: Comparison) -> list[Sentence]:
-    """Return the claims at equal costs for the two arms of the first sentence."""
+    """Return sentences that compare the two arms of the headline at equal costs."""
     if not comparison.ends:
         return []
     couple = comparison.ends[0].first, comparison.ends[0].second

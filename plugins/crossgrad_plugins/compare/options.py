@@ -12,7 +12,7 @@ _ARMS = "Arms"
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """How runs are compared."""
+    """Options of the comparison itself."""
 
     metric: str = option("psnr", "Metric to compare.", "NAME", heading=_WHAT)
     margin: float | None = option(
@@ -47,7 +47,7 @@ class Options:
 
 @dataclass(frozen=True, kw_only=True)
 class Command(Options):
-    """All options of the command: the comparison, its runs, and the output folder."""
+    """All options of the command: comparison, runs and output folder."""
 
     runs: list[Path] = argument(
         "RUN...|FOLDER",

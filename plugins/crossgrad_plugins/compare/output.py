@@ -1,4 +1,4 @@
-"""The output folder of a comparison; only files of a comparison are ever replaced."""
+"""The output folder of a comparison, in which only files of a comparison are replaced."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -13,25 +13,26 @@ from crossgrad_core.commands import (
     write_atomically,
 )
 
-#: Name of the page. A folder was written by a comparison if it contains a page with `MARK`.
+#: Name of the page. A page with the tag `MARK` shows that a folder was written by a comparison.
 PAGE: Final = "index.html"
-#: This tag is in the head of each page that `compare` wrote.
+#: `compare` writes this tag in the head of each page.
 MARK: Final = '<meta name="generator" content="crossgrad compare">'
 FIGURES: Final = "figures"
 _BEGINNING: Final = 2000
 
 
 def check_free(folder: Path, owned: Iterable[str] = ()) -> None:
-    """Refuse a folder that contains anything except an earlier comparison.
+    """Refuse a folder that contains files other than those of an earlier comparison.
 
-    An interrupted comparison has no page yet, and contains only files of a comparison.
+    The folder of an interrupted comparison has no page yet, but contains only files of a
+    comparison.
 
     Args:
         folder: The folder.
-        owned: All files that a comparison may have besides its page, as paths below the folder.
+        owned: Paths below the folder of all files that a comparison may write besides its page.
 
     Raises:
-        UserError: The folder contains other files; the message names them and the remedy.
+        UserError: The folder contains other files; the message names these files and what to do.
     """
     check_folder(folder)
     if not folder.is_dir() or is_comparison(folder):
@@ -64,12 +65,12 @@ def is_comparison(folder: Path) -> bool:
 
 
 def write_files(folder: Path, files: Mapping[str, bytes], owned: Iterable[str]) -> None:
-    """Write the files, the page last, and remove outdated files of an earlier comparison.
+    """Write the files, with the page last, and remove old files of an earlier comparison.
 
     Args:
-        folder: The folder: free, or an earlier comparison.
+        folder: The folder; it is free or contains an earlier comparison.
         files: Path below the folder -> content.
-        owned: All files that a comparison may have besides its page, as paths below the folder.
+        owned: Paths below the folder of all files that a comparison may write besides its page.
 
     Raises:
         UserError: The disk is full, or the folder is read-only.

@@ -15,8 +15,8 @@ from crossgrad_plugins.compare.run import Run
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-#: Limits that keep the page small: number of views of all scenes, of views of one scene, of arms
-#: per view, and of bytes.
+#: Limits of the page: number of views of all scenes, of views per scene, of arms per view, and of
+#: bytes.
 MOST_VIEWS, MOST_OF_A_SCENE, MOST_ARMS = 8, 3, 6
 MOST_BYTES: Final = 1_400_000
 _WIDTHS: Final = (320, 260, 200, 150)
@@ -28,10 +28,10 @@ class Picture:
     """A picture of the page.
 
     Attributes:
-        arm: The arm that rendered the picture; `photo` for the photo.
+        arm: The arm that rendered the picture, or `photo` for the photo.
         figure: The main metric of the view as text; empty for the photo.
-        render: The picture as data for the `src` attribute of an image.
-        error: The error picture, in the same form; empty for the photo.
+        render: The picture as a data URL for an image element.
+        error: The error picture as a data URL; empty for the photo.
     """
 
     arm: str
@@ -50,7 +50,7 @@ class WorstView:
         regime: Regime of the view.
         mean: The main metric, averaged over arms and seeds.
         by_arm: Arm -> the main metric, averaged over seeds.
-        pictures: The photo and the renders of the arms with one seed; empty without pictures.
+        pictures: The photo and the arms' renders of one seed; empty if no pictures are shown.
     """
 
     scene: str
@@ -62,7 +62,7 @@ class WorstView:
 
 
 def worst_views(comparison: Comparison) -> dict[str, list[WorstView]]:
-    """Return the held-out views of each scene, the worst first, without pictures."""
+    """Return the held-out views of each scene, worst first, without pictures."""
     by_scene: dict[str, list[WorstView]] = {}
     for scene in comparison.scenes:
         values: dict[tuple[str, str], dict[str, list[float]]] = {}
@@ -89,8 +89,8 @@ def with_pictures(
 ) -> tuple[list[WorstView], list[str]]:
     """Return the worst views of each scene with pictures, and notes about unreadable pictures.
 
-    A view is included only if all shown runs stored its pictures. Pictures are made smaller until
-    all of them fit into the page.
+    A view is included only if all runs that are shown have stored its pictures. The pictures are
+    reduced until all of them fit into the page.
     """
     shown: list[tuple[WorstView, list[tuple[str, Run]]]] = []
     share = min(MOST_OF_A_SCENE, max(1, MOST_VIEWS // max(1, len(views))))
@@ -111,9 +111,9 @@ def with_pictures(
 
 
 def _runs_of(comparison: Comparison, scene: str) -> list[tuple[str, Run]]:
-    """Return the best arms on a scene, each with one run.
+    """Return the best arms on a scene, with one run each.
 
-    All these runs have the lowest seed that the arms share.
+    All returned runs have the lowest seed that these arms have in common.
     """
     arms = [
         arm for arm in comparison.ranking if any(at == scene for at, _ in comparison.main[arm])

@@ -1,15 +1,15 @@
-"""The metric that is compared, its unit and margin, and the cost at which it is compared."""
+"""The metric that is compared, its unit and margin, and the costs."""
 
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, NamedTuple
 
-#: Amounts of at least this many seconds are shown without decimals.
+#: Numbers of seconds from this value on are shown without decimals.
 _WHOLE: Final = 10.0
 
 
 class _Kind(NamedTuple):
-    """A kind of metric, recognised by the start of its name; `margin` counts as no difference."""
+    """A kind of metric, recognised by the start of its name, with its default margin."""
 
     unit: str
     decimals: int
@@ -33,7 +33,7 @@ class Quantity:
         label: Name in texts and figures.
         unit: Unit of the metric; empty if it has no unit.
         decimals: Number of decimals shown.
-        margin: Largest difference that counts as no difference.
+        margin: Largest difference that counts as no difference in practice.
         falls: True if lower values are better.
     """
 
@@ -46,11 +46,14 @@ class Quantity:
 
     @classmethod
     def of(cls, name: str, margin: float | None = None, *, falls: bool = False) -> "Quantity":
-        """Return the metric with the given name, with its default margin unless another is given.
+        """Return the metric with the given name.
+
+        Without a given margin, it has its default margin.
 
         Args:
             name: Name of the metric.
-            margin: Largest difference that counts as no difference; None for the default.
+            margin: Largest difference that counts as no difference in practice; None for the
+                default.
             falls: True if lower values are better; always true for LPIPS.
         """
         start = next((start for start in _KINDS if name.startswith(start)), "")
@@ -61,11 +64,11 @@ class Quantity:
 
     @property
     def with_unit(self) -> str:
-        """Label with unit, for an axis or a table."""
+        """The label with its unit, for an axis or a table."""
         return f"{self.label} ({self.unit})" if self.unit else self.label
 
     def better(self, first: float, second: float) -> bool:
-        """Return True if the first of two values is better."""
+        """Return True if the first value is better than the second."""
         return first < second if self.falls else first > second
 
     def shown(self, value: float) -> str:
@@ -78,7 +81,7 @@ class Quantity:
 
 
 class ClockChoice(StrEnum):
-    """The choice of the seconds to compare."""
+    """Which seconds are compared."""
 
     AUTO = "auto"
     WALL = "wall"
@@ -92,10 +95,10 @@ class Cost:
 
     Attributes:
         name: Name in tables and file names.
-        column: Column of metrics.csv.
+        column: Its column in metrics.csv.
         axis: Label of the axis of a figure.
         unit: Unit, such as `s`.
-        title: Name inside a sentence: "at equal TITLE".
+        title: Name inside the phrase "at equal TITLE".
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""The ranking of arms, and the noise over seeds."""
+"""The ranking of arms, and the variation over seeds."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ class Standing:
 
     Attributes:
         seeds: Number of runs that have the metric.
-        mean: Mean of the metric.
+        mean: Mean of the metric over runs.
         spread: Standard deviation over seeds; NaN for one run.
     """
 
@@ -28,7 +28,7 @@ class Standing:
 def standings(
     runs: Mapping[str, Runs], quantity: Quantity, regime: str | None = None
 ) -> dict[str, dict[str, Standing]]:
-    """Return the metric by arm and scene; a scene is absent if no run has the metric there."""
+    """Return the metric by arm and scene, without scenes for which no run has the metric."""
     by_arm: dict[str, dict[str, Standing]] = {}
     for arm, by in runs.items():
         by_scene: dict[str, list[float]] = {}
@@ -46,10 +46,10 @@ def _standing(values: Sequence[float]) -> Standing:
 
 
 def scores(standing: Mapping[str, Mapping[str, Standing]]) -> dict[str, float]:
-    """Return each arm's mean difference from the mean of all arms, averaged over its scenes.
+    """Return each arm's mean difference from the mean of all arms, averaged over scenes.
 
-    The difference is taken per scene, so an arm gains nothing by omitting a hard scene. The result
-    is NaN without a metric.
+    The difference is computed per scene, so that an arm does not gain by omitting a difficult
+    scene. The result is NaN for an arm without a metric.
     """
     scenes = dict.fromkeys(scene for by in standing.values() for scene in by)
     level = {
@@ -63,7 +63,7 @@ def scores(standing: Mapping[str, Mapping[str, Standing]]) -> dict[str, float]:
 
 
 def ranked(standing: Mapping[str, Mapping[str, Standing]], quantity: Quantity) -> tuple[str, ...]:
-    """Return the arms from the best to the worst; arms without a metric are last."""
+    """Return the arms from best to worst; arms without a metric are last."""
     score = scores(standing)
     sign = 1.0 if quantity.falls else -1.0
     return tuple(sorted(score, key=lambda arm: (np.isnan(score[arm]), sign * score[arm])))
@@ -76,8 +76,8 @@ def noise(
 
     The deviation is pooled over arms.
 
-    Scenes with one seed per arm are left out, because their noise is unknown. Runs that represent
-    two arms count once.
+    Scenes with one seed per arm are left out, because they do not show the variation over seeds. A
+    run that belongs to two arms counts once.
 
     Args:
         standing: Result of `standings`.

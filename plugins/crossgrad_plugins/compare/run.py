@@ -1,4 +1,4 @@
-"""A run that has ended, and the settings that separate arms."""
+"""A finished run, and the settings that separate arms."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -18,10 +18,9 @@ if TYPE_CHECKING:
 Array: TypeAlias = NDArray[np.float64]
 #: A value of a setting as text, such as `0.4`, `scaffold` or `pcgrad+soft`.
 Settings: TypeAlias = dict[str, str]
-#: The value of a setting that is not set.
+#: The text for a setting that is not set.
 ABSENT: Final = "-"
-#: Settings that do not separate arms: the location and the length of a run, and components that
-#: only observe.
+#: Settings that do not separate arms: paths and length of a run, and components that only observe.
 _NO_ARM: Final = frozenset(
     {
         *("crossgrad", "scene", "seed", "out"),
@@ -38,11 +37,11 @@ class Run:
     """A run that has ended.
 
     Attributes:
-        name: The folder of the run, as it is shown.
+        name: The folder of the run, as shown to users.
         results: The results of the run.
-        summary: Content of the run's summary.json.
-        config: The configuration in the format of this version.
-        label: Label of the configuration in a sweep; None without a sweep.
+        summary: Content of summary.json.
+        config: The configuration of the run, converted to the format of this version.
+        label: Label of the run's configuration in a sweep; None if there is no sweep.
     """
 
     name: str
@@ -78,7 +77,7 @@ class Run:
 
     @cached_property
     def length(self) -> tuple[str, float]:
-        """The unit and the amount of the run's budget."""
+        """The unit and amount of the run's budget."""
         if seconds := self.config.get("planned_seconds"):
             return ("s CPU" if self.config.get("clock") == "cpu" else "s"), float(seconds)
         views = self.config.get("max_views")
@@ -92,14 +91,14 @@ class Run:
         return text_of(self.length)
 
     def final(self, name: str, regime: str | None = None) -> float | None:
-        """Return the final metric, overall or of a regime; None if it is missing or not finite."""
+        """Return the final metric, overall or of a regime; None if missing or not finite."""
         value = self.results.figure(name, regime)
         return value if value is not None and isfinite(value) else None
 
     def series(self, name: str, cost: Cost, regime: str | None = None) -> tuple[Array, Array]:
-        """Return the costs [n] and the metric values [n] of the evaluations.
+        """Return the costs [n] and the metric values [n] of a run's evaluations.
 
-        Costs are ascending.
+        The costs are in ascending order.
         """
         points = self.results.curve(name, regime, over=cost.column)
         values = {x: y for x, y in points if isfinite(x) and isfinite(y)}
@@ -128,11 +127,11 @@ def text_of(length: tuple[str, float]) -> str:
 
 
 def settings_of(config: Mapping[str, Any]) -> Settings:
-    """Return the values of the settings that can separate arms, by setting.
+    """Return the values of the settings that can separate arms: setting -> value.
 
-    A setting that is null counts as not set, and its value is `-`. A component becomes `backbone`,
-    and its options become `backbone.sh_degree`. A chain of operators becomes `operator` with the
-    names joined by `+`, and its options become `operator.1.c`.
+    A setting with the value null counts as not set, and its text is `-`. A component is listed as
+    `backbone`, and an option of it as `backbone.sh_degree`. Several operators are listed as one
+    `operator` with names joined by `+`; an option is listed as `operator.1.c`.
     """
     return {
         name: _text(value)

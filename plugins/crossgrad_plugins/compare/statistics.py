@@ -12,32 +12,31 @@ from numpy.typing import NDArray
 DRAWS: Final = 2000
 _TWO: Final = 2
 _SEED: Final = 20_150_101
-#: The interval is computed by bootstrap if there are at least this many pairs.
+#: The interval is computed by bootstrap from this number of pairs on.
 BOOTSTRAP_FROM: Final = 10
-#: Confidence level of the interval for a difference, and confidence level of the interval for
-#: equivalence.
+#: Confidence level of the interval for a difference, and of the interval for equivalence.
 WIDE, NARROW = 0.95, 0.90
 MEAN, IQM = "mean, Student's t", "IQM, bootstrap"
 _UNKNOWN = (-inf, inf)
 Interval: TypeAlias = tuple[float, float]
-#: Maximum number of pairs that the report suggests for one comparison.
+#: Maximum number of pairs that a report suggests.
 MOST_PAIRS: Final = 1000
-#: With at most this number of comparisons, verdicts are not corrected for multiple tests.
+#: Up to this number of comparisons, verdicts are not corrected for multiple tests.
 UNCORRECTED: Final = 5
 
 
 def iqm(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the interquartile mean along the last axis.
 
-    A value at the border of the middle half counts with the share that is inside. For two values
-    the result is their mean; for three, the middle value has a weight of 2/3.
-    (`scipy.stats.trim_mean` only removes whole values.)
+    A value at the edge of the middle half has the weight of its part inside the half. The
+    interquartile mean of two values is their mean. Of three values, the middle value has the weight
+    2/3. `scipy.stats.trim_mean` is not used, because it only removes whole values.
 
     Args:
         values: [..., n] numbers, n >= 1.
 
     Returns:
-        [...] means.
+        [...] the interquartile means.
     """
     count = values.shape[-1]
     first = np.arange(count, dtype=np.float64)
@@ -49,7 +48,7 @@ def iqm(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Bootstrap:
-    """The estimates of many resampled sets of pairs.
+    """The estimates from many resampled sets of pairs.
 
     Attributes:
         draws: [DRAWS] estimates, sorted.
@@ -84,7 +83,7 @@ class Bootstrap:
         return cls(np.sort(draws), freedom)
 
     def interval(self, level: float) -> tuple[float, float]:
-        """Return the two-sided interval of a level such as 0.95."""
+        """Return the two-sided interval for a confidence level such as 0.95."""
         from scipy.special import ndtr, stdtrit
 
         tail = float(ndtr(-stdtrit(self.freedom, 0.5 + level / 2.0)))
@@ -92,18 +91,19 @@ class Bootstrap:
         return float(low), float(high)
 
     def cdf(self, border: float) -> float:
-        """Return the p-value of an estimate of at most `border`."""
+        """Return the p-value of the hypothesis that the true value is at most `border`."""
         return self._tail(_share(self.draws, border), float(np.median(self.draws)) - border)
 
     def sf(self, border: float) -> float:
-        """Return the p-value of an estimate of at least `border`."""
+        """Return the p-value of the hypothesis that the true value is at least `border`."""
         return self._tail(1.0 - _share(self.draws, border), border - float(np.median(self.draws)))
 
     def _tail(self, share: float, distance: float) -> float:
-        """Return the p-value for a share of the draws, consistent with the widened intervals.
+        """Return the p-value for a share of the draws, consistent with the widened interval.
 
-        If a border is beyond all draws, its distance from the median of the draws in standard
-        deviations is used instead. Otherwise the number of draws would limit the p-value.
+        If a border is beyond all draws, its distance from the median of the draws, in standard
+        deviations, gives the p-value. Otherwise the p-value could not be smaller than one divided
+        by the number of draws.
         """
         from scipy.special import ndtri, stdtr
 
@@ -118,13 +118,16 @@ class Bootstrap:
 def _deviations(
     values: NDArray[np.float64], strata: Sequence[NDArray[np.intp]]
 ) -> NDArray[np.float64]:
-    """Return the stretched deviations of scenes with two pairs from the means of their scenes."""
+    """Return unbiased deviations from the scene's mean, for scenes with two pairs."""
     deviations = [sqrt(_TWO) * (values[stratum] - values[stratum].mean()) for stratum in strata]
     return np.concatenate(deviations) if deviations else np.zeros(0)
 
 
 def _share(draws: NDArray[np.float64], border: float) -> float:
-    """Return the share of sorted draws below a border; draws on the border count half."""
+    """Return the share of sorted draws below a border.
+
+    Draws on the border count half.
+    """
     below = int(np.searchsorted(draws, border))
     up_to = int(np.searchsorted(draws, border, side="right"))
     return (below + up_to) / (2 * len(draws))
@@ -145,7 +148,7 @@ class SceneEstimate:
     Attributes:
         scene: Name of the scene.
         center: The mean difference.
-        wide: The 95 % interval by Student's t.
+        wide: The 95 % interval from Student's t distribution.
     """
 
     scene: str
@@ -163,16 +166,18 @@ class Estimate:
         margin: Largest difference that counts as no difference in practice.
         center: The estimate: the mean below 10 pairs, the interquartile mean from 10 pairs on.
         method: The kind of mean, and the method of the interval.
-        wide: The 95 % interval; a difference is shown if the interval excludes zero.
-        narrow: The 90 % interval; equivalence is shown if the interval is within the margin.
+        wide: The 95 % interval; if it excludes zero, there is a difference.
+        narrow: The 90 % interval; if it is within the margin, the arms are equivalent.
         deviation: Standard deviation of the pairs' differences; NaN for a single pair.
-        p_different: Two-sided p-value of no difference.
-        p_equivalent: p-value of a difference of at least the margin (two one-sided tests).
-        p_above: p-value of a difference of at least the margin upwards (a one-sided test).
-        needed: Number of pairs that would make the 90 % interval as narrow as the margin, if the
-            interval narrows as expected; None if this cannot be estimated.
-        by_scene: The estimate of each scene; empty if all pairs are from one scene. The
-            interquartile mean can hide a scene that differs from the other scenes.
+        p_different: p-value of the hypothesis of no difference (two-sided).
+        p_equivalent: p-value of the hypothesis that the difference is at least the margin in either
+            direction (two one-sided tests).
+        p_above: p-value of the hypothesis that the difference is at least the margin upwards
+            (one-sided).
+        needed: Estimated number of pairs with which the 90 % interval fits into the margins; None
+            if it cannot be estimated.
+        by_scene: The estimate of each scene; empty if there is only one scene. It shows a scene
+            that differs from the others, which an interquartile mean can hide.
     """
 
     pairs: int
@@ -201,23 +206,23 @@ class Estimate:
 
 
 class Law(Protocol):
-    """The distribution of an estimate: SciPy's Student's t, or a bootstrap."""
+    """The distribution of an estimate: Student's t from SciPy, or a bootstrap."""
 
     def interval(self, level: float) -> Interval:
-        """Return the two-sided interval of a level such as 0.95."""
+        """Return the two-sided interval for a confidence level such as 0.95."""
 
     def cdf(self, border: float) -> float:
-        """Return the p-value of an estimate of at most `border`."""
+        """Return the p-value of the hypothesis that the true value is at most `border`."""
 
     def sf(self, border: float) -> float:
-        """Return the p-value of an estimate of at least `border`."""
+        """Return the p-value of the hypothesis that the true value is at least `border`."""
 
 
 def estimate(differences: Sequence[float], scenes: Sequence[str], margin: float) -> Estimate:
     """Estimate a difference from pairs of runs.
 
     Args:
-        differences: Difference of each pair, all finite; at least one.
+        differences: Finite difference of each pair; at least one.
         scenes: The scene of each pair.
         margin: Largest difference that counts as no difference in practice.
     """
@@ -251,7 +256,7 @@ def estimate(differences: Sequence[float], scenes: Sequence[str], margin: float)
 
 
 def student(values: NDArray[np.float64]) -> Law:
-    """Return Student's distribution of the mean of two or more values."""
+    """Return Student's t distribution of the mean of two or more values."""
     from scipy.stats import t
 
     error = float(values.std(ddof=1)) / sqrt(len(values))
@@ -262,14 +267,14 @@ def student(values: NDArray[np.float64]) -> Law:
 
 
 def pairs_needed(deviation: float, margin: float) -> int | None:
-    """Return the number of pairs with which the 90 % interval of a mean fits into the margins.
+    """Return how many pairs are needed until the 90 % interval of a mean fits into the margins.
 
     Args:
         deviation: Standard deviation of the pairs' differences.
-        margin: The margin, above 0.
+        margin: The margin, which must be above 0.
 
     Returns:
-        The number of pairs; None if it is above 1,000.
+        The number of pairs, or None if it is above 1,000.
     """
     from scipy.special import stdtrit
 
@@ -279,7 +284,7 @@ def pairs_needed(deviation: float, margin: float) -> int | None:
 
 
 def _wider(narrow: Interval, pairs: int, margin: float) -> int | None:
-    """Like `pairs_needed`, but for an interquartile mean, from its interval with these pairs."""
+    """Like `pairs_needed`, but for an interquartile mean with a known interval."""
     needed = pairs * ((narrow[1] - narrow[0]) / (2.0 * margin)) ** 2
     return max(2, ceil(needed)) if needed <= MOST_PAIRS else None
 
@@ -310,8 +315,8 @@ def verdicts(family: Sequence[Estimate]) -> list[Verdict]:
     """Return the verdict on each comparison of a table.
 
     The verdict is `different` if the 95 % interval excludes zero, else `equivalent` if the 90 %
-    interval is within the margin. With more than five comparisons, the p-value of the test,
-    corrected with Holm's method, must also be below the level of the test.
+    interval is within the margin. If a table has more than five comparisons, a second condition
+    applies: the p-value, corrected by Holm's method, must be below the level of the test.
     """
     if len(family) <= UNCORRECTED:
         return [_verdict(member.differs, member.is_small) for member in family]
@@ -324,14 +329,14 @@ def verdicts(family: Sequence[Estimate]) -> list[Verdict]:
 
 
 def corrected(values: Sequence[float]) -> list[float]:
-    """Return the p-values of a table of comparisons, adjusted by Holm if there are more than 5."""
+    """Return the p-values of a table, adjusted by Holm's method if there are more than five."""
     return holm(values) if len(values) > UNCORRECTED else list(values)
 
 
 def holm(values: Sequence[float]) -> list[float]:
     """Return p-values adjusted by Holm's method (Scandinavian Journal of Statistics 6, 1979).
 
-    NaN is the p-value of a test that was not made: it is returned unchanged and not counted.
+    NaN stands for a test that was not made. It is returned unchanged and does not count.
     """
     ranked = sorted((value, index) for index, value in enumerate(values) if not isnan(value))
     adjusted, largest = list(values), 0.0
@@ -342,10 +347,10 @@ def holm(values: Sequence[float]) -> list[float]:
 
 
 def opposed(found: Estimate, verdict: Verdict, margin: float) -> tuple[SceneEstimate, ...]:
-    """Return the scenes whose own 95 % intervals contradict the verdict on all scenes.
+    """Return the scenes whose own 95 % intervals contradict the verdict of all scenes together.
 
-    A scene contradicts a difference if its own difference has the opposite sign. A scene
-    contradicts equivalence if its difference is beyond the margin.
+    A scene contradicts the verdict `different` if its own difference has the opposite sign. A scene
+    contradicts the verdict `equivalent` if its own difference is beyond the margin.
     """
     if verdict is Verdict.INCONCLUSIVE:
         return ()

@@ -1,4 +1,4 @@
-"""The tables of a comparison: text rows for page and terminal, value rows for CSV files."""
+"""The tables of a comparison: texts for page and terminal, values for CSV files."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -50,7 +50,7 @@ class Table:
 
     Attributes:
         columns: The columns.
-        rows: The rows, with a text for each column.
+        rows: The rows, each with one text per column.
         title: Title of the table.
         caption: Description of the table.
     """
@@ -65,7 +65,7 @@ _ARM: Final = Column("arm", "arm")
 
 
 def standing_table(c: Comparison) -> Table:
-    """Return the arms from the best to the worst, with their metrics and differences."""
+    """Return the table of arms from best to worst, with metrics and differences."""
     reference = c.baseline or c.ranking[0]
     unit = f", {c.quantity.unit}" if c.quantity.unit else ""
     return Table(
@@ -92,7 +92,7 @@ def _standing(c: Comparison, arm: str, scene: str) -> str:
 
 
 def _against(c: Comparison, arm: str, reference: str) -> tuple[str, str]:
-    """Return the arm's difference from the reference, and the verdict."""
+    """Return the difference of an arm from the reference arm, and the verdict."""
     for contrast in c.ends:
         if contrast.estimate is not None and {contrast.first, contrast.second} == {arm, reference}:
             sign = 1.0 if contrast.first == arm else -1.0
@@ -104,7 +104,10 @@ def _against(c: Comparison, arm: str, reference: str) -> tuple[str, str]:
 
 
 def cost_table(c: Comparison) -> Table:
-    """Return the mean costs of each arm over the scenes and seeds that all arms have."""
+    """Return the mean costs of each arm.
+
+    Only scenes and seeds that all arms have are used.
+    """
     problems = [by.keys() for by in c.main.values() if by]
     shared = set.intersection(*map(set, problems)) if problems else set()
     rows = []
@@ -135,7 +138,7 @@ def _mean(values: Sequence[float | None], cost: Cost | None = None) -> str:
 
 
 def contrast_tables(c: Comparison) -> tuple[Table, ...]:
-    """Return the tables of contrasts that are not empty."""
+    """Return the tables of contrasts, without empty tables."""
     tables = (
         contrast_table(c.ends, "At the end of the runs", "The primary comparison."),
         contrast_table(
@@ -176,13 +179,13 @@ def contrast_table(
     caption: str = "",
     first: Mapping[str, Callable[[Contrast], str]] = MappingProxyType({}),
 ) -> Table:
-    """Return contrasts as a table.
+    """Return a table with one contrast per row.
 
     Args:
         contrasts: The contrasts.
         title: Title of the table.
         caption: Description of the table.
-        first: Heading -> text function, for columns before all other columns.
+        first: Heading -> function that returns the text, for columns before all other columns.
     """
     if len(contrasts) > UNCORRECTED:
         caption += (
@@ -227,7 +230,7 @@ def _contrast_texts(contrast: Contrast, estimate: Estimate) -> list[str]:
 
 
 def reached_table(c: Comparison) -> Table:
-    """Return the cost to reach a quality: a row for each scene and arm, a cell for each cost."""
+    """Return the costs to reach a quality: one row per scene and arm, one column per cost."""
     groups: dict[tuple[str, str], list[Reached]] = {}
     for row in c.reached:
         groups.setdefault((row.scene, row.arm), []).append(row)
@@ -252,7 +255,7 @@ def reached_table(c: Comparison) -> Table:
 
 
 def settings_table(c: Comparison) -> Table:
-    """Return the settings that differ between the arms, a row for each."""
+    """Return the settings that differ between the arms, one setting per row."""
     settings = dict.fromkeys(key for arm in c.arms for key in arm.settings)
     return Table(
         [Column("setting", "text"), *(Column(arm.name, "text") for arm in c.arms)],
@@ -262,7 +265,7 @@ def settings_table(c: Comparison) -> Table:
 
 
 def runs_table(c: Comparison) -> Table:
-    """Return the runs that represent an arm, a scene and a seed."""
+    """Return the table of runs that represent an arm on a scene with a seed."""
 
     def text(value: float | None, shown: Callable[[float], str]) -> str:
         return _NONE if value is None else shown(value)

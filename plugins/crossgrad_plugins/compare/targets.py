@@ -14,8 +14,9 @@ from crossgrad_plugins.compare.run import Run
 
 #: The performance profile is drawn up to this ratio.
 LARGEST_RATIO = 4.0
-#: A run may end earlier than an amount by this share, and its last value still counts for the
-#: amount. The reason is that the length of a run with a time limit is a whole number of steps.
+#: Tolerance, as a share of an amount: a run that ends slightly before this amount still counts with
+#: its last value. The tolerance is needed because a run with a time limit ends after a whole number
+#: of steps.
 _SAME_END = 0.03
 
 
@@ -28,8 +29,8 @@ class Reached:
         scene: The scene.
         target: The quality.
         arm: The arm.
-        amounts: Seed -> amount spent until the quality was reached; infinite if the run failed or
-            never reached it.
+        amounts: Seed -> amount that was spent until the quality was reached; infinite if the run
+            failed or never reached the quality.
     """
 
     cost: Cost
@@ -45,7 +46,7 @@ class Reached:
 
     @property
     def median(self) -> float:
-        """The median over all runs; infinite if half of them never reached the quality."""
+        """The median amount over all runs; infinite if half of the runs never succeeded."""
         ordered = sorted(self.amounts.values())
         low, high = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
         return inf if high == inf else (low + high) / 2.0
@@ -54,10 +55,10 @@ class Reached:
 def targets_of(
     runs: Mapping[str, Runs], quantity: Quantity, given: float | None
 ) -> dict[str, float]:
-    """Return the quality to reach on each scene: given, or the median end of the weakest arm.
+    """Return each scene's target: given, or the median final value of the weakest arm.
 
-    With an even number of runs, the worse of the two middle runs counts. More than half of the runs
-    reach this quality, so the median of their costs is finite.
+    If the number of runs is even, the worse of the two middle runs is used. More than half of the
+    runs reach this quality, so the median of their costs is finite.
     """
     finals: dict[str, dict[str, list[float]]] = {}
     for arm, by in runs.items():
@@ -101,9 +102,9 @@ def reached(
 def ratios(rows: Sequence[Reached]) -> dict[str, list[float]]:
     """Return the cost of each arm on each problem, divided by the smallest cost of all arms.
 
-    A problem is a scene and a seed with a run of every arm. A run that never reaches the quality
-    has an infinite ratio and stays in the denominator. All runs of a problem that no arm solves
-    have an infinite ratio, too.
+    A problem is a scene and a seed for which every arm has a run. A run that never reaches the
+    quality has an infinite ratio, and counts in the total. If no arm solves a problem, all its runs
+    have an infinite ratio.
     """
     amounts: dict[str, dict[Problem, float]] = {}
     for row in rows:
@@ -128,7 +129,7 @@ def value_at(run: Run, quantity: Quantity, cost: Cost, amount: float) -> float |
     """Return the metric at a cost, interpolated between two evaluations.
 
     Returns:
-        The value; None before the first evaluation, and after the end.
+        The value; None before the first evaluation and after the end of the run.
     """
     x, y = run.series(quantity.name, cost)
     if not len(x) or amount < x[0] or amount > (1.0 + _SAME_END) * x[-1]:
@@ -137,14 +138,14 @@ def value_at(run: Run, quantity: Quantity, cost: Cost, amount: float) -> float |
 
 
 def shared_amount(runs: Iterable[Run], quantity: Quantity, cost: Cost) -> float | None:
-    """Return the smallest final cost of all runs; None if a run was never evaluated."""
+    """Return the smallest final cost of all runs; None if a run has no evaluation."""
     ends = [x[-1] if len(x := run.series(quantity.name, cost)[0]) else None for run in runs]
     amounts = [float(end) for end in ends if end is not None]
     return min(amounts) if amounts and len(amounts) == len(ends) else None
 
 
 def is_inside(run: Run, quantity: Quantity, cost: Cost, amount: float) -> bool:
-    """Return True if the run continued well beyond the amount, before the end of its schedule."""
+    """Return True if the amount lies well before the end of the run."""
     x, _ = run.series(quantity.name, cost)
     return bool(len(x)) and amount < (1.0 - _SAME_END) * x[-1]
 

@@ -11,7 +11,7 @@ from typing_extensions import override
 from crossgrad_core.plugin import DensifyContext, PluginState, Selection, screen_statistics
 from crossgrad_plugins.densifiers.clone_split import AxisSplit, Growth
 
-#: Criterion -> the names of the thresholds that it uses.
+#: Criterion -> the names of the thresholds that the criterion uses.
 _THRESHOLDS: Final[Mapping[str, frozenset[str]]] = {
     "abs": frozenset({"grad_threshold", "abs_threshold"}),
     "gsplat": frozenset({"gsplat_threshold"}),
@@ -20,15 +20,15 @@ _THRESHOLDS: Final[Mapping[str, frozenset[str]]] = {
 
 
 class AbsGradDensityControl(AxisSplit):
-    """Adaptive density control with absolute gradients, so opposite pixel gradients do not cancel.
+    """Adaptive density control by absolute gradients, in which opposite gradients cannot cancel.
 
-    In addition to the norm g of the projected mean's gradient, the densifier sums the pixels'
-    absolute gradients, separately for x and y. The norm ga of these two sums is averaged over the
-    renders in which the Gaussian was visible. Criteria: `abs` clones by g and splits by ga (AbsGS).
-    `gsplat` clones and splits by ga alone. `quantile` clones and splits if g is above its
-    threshold, or if ga is among the N largest values, where N is the number of Gaussians with g
-    above its threshold. This criterion uses the 1-norm instead of the 2-norm (Mip-Splatting's
-    code).
+    Let g be the norm of the gradient with respect to the projected mean. The densifier also sums
+    the absolute values of the pixels' gradients in x and in y. ga is the norm of these two sums,
+    averaged over the renders in which the Gaussian was visible. Criterion `abs` clones by g and
+    splits by ga (AbsGS). Criterion `gsplat` clones and splits by ga alone. Criterion `quantile`
+    first counts the N Gaussians whose g is above the threshold; these Gaussians and the N Gaussians
+    with the largest ga are cloned or split. Criterion `quantile` computes ga as a 1-norm instead of
+    a 2-norm, as in the code of Mip-Splatting.
     """
 
     needs = frozenset({"abs_gradient"})
@@ -73,10 +73,10 @@ class AbsGradDensityControl(AxisSplit):
         return Growth(clone=clones & small, split=splits & ~small, strength=absolute)
 
     def _by_quantile(self, gradient: Tensor, absolute: Tensor) -> Tensor:
-        """Return [P] bool: g >= threshold, or ga >= its (1 - rho) quantile.
+        """Return [P], True if g >= threshold or if ga is at least its (1 - rho) quantile.
 
-        rho is the share of primitives with g >= threshold. If rho is 0, no primitive grows. A
-        primitive that was never visible (ga = 0) does not grow either.
+        rho is the share of primitives whose g is at least the threshold. If rho is 0, no primitive
+        grows. A primitive that was never visible (ga = 0) does not grow either.
         """
         moves = gradient >= self.grad_threshold
         if not bool(moves.any()):
@@ -87,14 +87,14 @@ class AbsGradDensityControl(AxisSplit):
 
 
 def gradient_sums(context: DensifyContext, state: PluginState, order: int = 2) -> dict[str, Tensor]:
-    """Return the sums [P] of g, of ga and of the renders that showed a primitive.
+    """Return the sums [P] of g and of ga, and the number of renders that showed a primitive.
 
     The sums include the views of this step.
 
     Args:
-        context: The step.
+        context: The context of the step.
         state: The state with the sums of earlier steps.
-        order: The norm of ga.
+        order: Order of the norm of the two absolute sums: 1 or 2.
     """
     totals = screen_statistics.sums(context, state, ("gradient", "absolute", "renders"))
     for record in context.views:
@@ -113,7 +113,7 @@ def gradient_sums(context: DensifyContext, state: PluginState, order: int = 2) -
 def quantile(values: Tensor, share: float) -> Tensor:
     """Return the quantile of `values` [P > 0] by linear interpolation.
 
-    `torch.quantile` accepts at most 2^24 values.
+    This function exists because `torch.quantile` accepts at most 2^24 values.
     """
     ordered = values.sort().values
     position = share * (len(ordered) - 1)

@@ -1,4 +1,4 @@
-"""Adaptive density control of 3DGS: clone, split, prune, opacity reset (Kerbl et al. 2023, 5.2)."""
+"""Adaptive density control of 3DGS: clone, split, prune, opacity reset (Kerbl et al. 2023)."""
 
 import torch
 from pydantic import Field
@@ -10,11 +10,11 @@ from crossgrad_plugins.densifiers.clone_split import AxisSplit, Growth
 
 
 class AdaptiveDensityControl(AxisSplit):
-    """Clones small and splits large Gaussians with a large screen gradient; prunes faint Gaussians.
+    """Clones small and splits large Gaussians with a large gradient; prunes faint Gaussians.
 
-    The statistic of a Gaussian is a mean over the renders in which it was visible. The densifier
-    averages the norm of the loss gradient with respect to the projected mean in NDC units (pixel
-    gradient times W/2, H/2). Each view contributes the gradient of its own loss.
+    The gradient of a Gaussian is averaged over the renders in which the Gaussian was visible. The
+    averaged value is the norm of the loss gradient with respect to the projected mean in NDC units
+    (pixel gradient times W/2, H/2). Each view contributes the gradient of the view's own loss.
     """
 
     grad_threshold: float = Field(

@@ -27,12 +27,12 @@ from crossgrad_core.plugin import (
     apply_to_parameters,
 )
 
-#: A split divides the scales by this factor (3DGS).
+#: A split divides the scales of the parent by this factor (3DGS).
 SPLIT_SHRINK = 1.6
-#: Length of a child along the axis, as a share of the parent. The children are placed at the
-#: distance `_APART` on both sides of the parent's centre, so that both children together have the
-#: variance of the parent. Their opacity is multiplied by `_FAINTER`, so that both together cover as
-#: much as the parent.
+#: Length of a child along the parent's longest axis, relative to the parent's length. The
+#: children's centres are at the distance `_APART` on both sides of the parent's centre. Together,
+#: the two children then have the variance of the parent. The opacity of each child is the parent's
+#: opacity times `_FAINTER`, so that both children together cover as much as the parent.
 _KEPT: Final = 0.6
 _APART: Final = sqrt(1.0 - _KEPT**2)
 _FAINTER: Final = 1.0 / (2.0 * _KEPT)
@@ -40,14 +40,14 @@ _FAINTER: Final = 1.0 / (2.0 * _KEPT)
 
 @dataclass(frozen=True)
 class Growth:
-    """The primitives that grow.
+    """The primitives that an edit clones or splits.
 
     Attributes:
         clone: [P] bool, primitives that are duplicated in place.
-        split: [P] bool, primitives that are replaced by two smaller ones; no primitive is both
-            split and cloned.
-        strength: [P], priority of each primitive; the strongest primitives grow first if the budget
-            is short.
+        split: [P] bool, primitives that are replaced by two smaller primitives; a primitive is not
+            both split and cloned.
+        strength: [P] priority of each primitive; if the budget is short, the strongest primitives
+            grow first.
     """
 
     clone: Tensor
@@ -55,13 +55,13 @@ class Growth:
     strength: Tensor
 
     def among(self, may_grow: Tensor | None) -> "Growth":
-        """Return the growth limited to primitives that may grow [P]; None means all."""
+        """Return the growth, limited to primitives that may grow [P]; None means all primitives."""
         if may_grow is None:
             return self
         return replace(self, clone=self.clone & may_grow, split=self.split & may_grow)
 
     def limited(self, room: int) -> tuple["Growth", int]:
-        """Return the growth of the `room` strongest primitives, and how many were left out."""
+        """Return the growth of the `room` strongest primitives, and the number of omitted ones."""
         wanted = self.clone | self.split
         left_out = max(0, int(wanted.sum()) - room)
         if left_out == 0:
@@ -74,12 +74,12 @@ class Growth:
 
 @dataclass(frozen=True)
 class Plan:
-    """The new set before pruning: survivors, clones, then first and second children.
+    """The primitives between growth and pruning: survivors, clones, then both children.
 
     Attributes:
         source: [M] int64 old index of each new primitive.
-        fresh: [M] bool, clones and children.
-        child: [M] bool, children of a split.
+        fresh: [M] bool, True for clones and children of a split.
+        child: [M] bool, True for children of a split.
     """
 
     source: Tensor
@@ -98,11 +98,11 @@ class Plan:
 
 
 class CloneSplit(Densifier):
-    """A densifier that grows primitives by a screen statistic, and prunes faint and huge Gaussians.
+    """A densifier that grows by a screen statistic, and prunes faint and huge Gaussians.
 
-    A subclass defines the statistics to collect and the primitives that grow; all other steps
-    follow 3DGS. The published pruning rule by screen radius never fires in the original code, so it
-    is left out.
+    A subclass defines the statistics and the primitives that grow; all other steps follow 3DGS.
+    3DGS also describes pruning by screen radius, which has no effect in the published code; it is
+    left out.
     """
 
     tensors = frozenset({"means", "scales", "quats", "opacities"})
@@ -124,28 +124,33 @@ class CloneSplit(Densifier):
 
     @abstractmethod
     def observed(self, context: DensifyContext, state: PluginState) -> PluginState:
-        """Return the statistics with the views of this step added, in order of the views."""
+        """Return the statistics after the views of this step were added, in order of the views."""
 
     @abstractmethod
     def growth(self, context: DensifyContext, state: PluginState, small: Tensor) -> Growth:
         """Return the primitives that grow.
 
         Args:
-            context: The step.
-            state: The statistics.
-            small: [P] bool, primitives that are small and therefore cloned.
+            context: The context of the step.
+            state: The state with the statistics.
+            small: [P] bool, True for primitives that are small and therefore cloned.
         """
 
     def divided(self, context: DensifyContext, growth: Growth) -> Growth:
-        """Return which growing primitives are cloned or split; by default, `growth` unchanged."""
+        """Return the growth with other choices between clone and split.
+
+        By default, the growth is unchanged.
+        """
         return growth
 
     def grown_values(
         self, context: DensifyContext, state: PluginState, plan: Plan
     ) -> dict[str, Rows]:
-        """Return new values for rows of the plan; by default means and scales of the children.
+        """Return new values for rows of the plan.
 
-        Source: 3DGS. The means are drawn from the parent's Gaussian, and the scales are divided by
+        By default, these are means and scales of the children.
+
+        Source: 3DGS, which draws the means from the parent's Gaussian and divides the scales by
         1.6.
         """
         rows = plan.child.nonzero().squeeze(1)
@@ -193,7 +198,10 @@ class CloneSplit(Densifier):
     def pruned(
         self, context: DensifyContext, state: PluginState, plan: Plan, values: Mapping[str, Rows]
     ) -> Tensor:
-        """Return [M] bool, primitives of the plan to remove; by default faint or large ones."""
+        """Return [M], True for primitives of the plan to remove.
+
+        By default, these are faint and large primitives.
+        """
         opacities = sigmoid(_planned(context, plan, values, "opacities"))
         pruned = opacities < self.prune_opacity
         if context.schedule.prunes_large(context.step):
@@ -209,7 +217,7 @@ class CloneSplit(Densifier):
 
 
 def edited_parameters(context: DensifyContext, edit: Edit) -> Parameters:
-    """Return the parameters after an edit, including derived tensors."""
+    """Return the parameters after an edit, including tensors that depend on other parameters."""
     after = apply_to_parameters(edit, context.backbone.blocks(), context.parameters)
     if edit.source is None:
         return after
@@ -218,7 +226,7 @@ def edited_parameters(context: DensifyContext, edit: Edit) -> Parameters:
 
 
 def drawn_offsets(context: DensifyContext, parents: Tensor) -> Tensor:
-    """Return [R, 3] one sample of each parent's Gaussian, relative to its mean."""
+    """Return [R, 3] a random sample of each parent's Gaussian, relative to its mean."""
     log_scales = context.parameters["scales"].detach()[parents]
     draws = context.rng.standard_normal((parents.shape[0], 3)).astype(np.float32)
     noise = torch.from_numpy(draws).to(log_scales)
@@ -227,7 +235,7 @@ def drawn_offsets(context: DensifyContext, parents: Tensor) -> Tensor:
 
 
 def _planned(context: DensifyContext, plan: Plan, values: Mapping[str, Rows], name: str) -> Tensor:
-    """Return a parameter of the plan's primitives, with new values filled in."""
+    """Return a parameter for the primitives of the plan, with the new values inserted."""
     tensor = context.parameters[name].detach()[plan.source]
     if name in values:
         tensor[values[name].rows] = values[name].values
@@ -235,7 +243,7 @@ def _planned(context: DensifyContext, plan: Plan, values: Mapping[str, Rows], na
 
 
 def _compacted(values: Mapping[str, Rows], keep: Tensor) -> dict[str, Rows]:
-    """Return the values of the rows that are kept [M], with their new row numbers."""
+    """Return the values of the rows to keep [M], and their row numbers after pruning."""
     new_rows = torch.cumsum(keep, 0) - 1
     compacted = {}
     for name, old in values.items():
@@ -251,12 +259,12 @@ def _zeroed(state: PluginState) -> PluginState:
 
 
 class AxisSplit(CloneSplit):
-    """Clones and splits as in 3DGS, or splits every growing Gaussian along its longest axis.
+    """Clones and splits as in 3DGS, or splits each growing Gaussian along its longest axis.
 
-    A clone has the same position and gradients as its parent. Both move together until noise
-    separates them, and together they are more opaque than the former parent. Children at random
-    positions leave holes in the image. Children side by side on the axis look like the parent, and
-    they differ from the first step on.
+    A clone has the same position and the same gradients as its parent. Parent and clone therefore
+    move together until noise separates them, and together they are more opaque than the parent was.
+    Children of a 3DGS split have random positions, which leave holes in the image. Two children on
+    the longest axis look like the parent, and they differ from the first step on.
     """
 
     division: Literal["drawn", "axis"] = Field(
@@ -267,14 +275,14 @@ class AxisSplit(CloneSplit):
     )
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """Return the options without an effect; see `HasUnusedOptions`."""
+        """Return the options that have no effect; see `HasUnusedOptions`."""
         if self.division != "axis" or self.by_size:
             return {}
         return {"split_scale": "with division axis the size has no effect; leave the option out"}
 
     @property
     def by_size(self) -> bool:
-        """True if `split_scale` also selects the statistic that decides about growth."""
+        """True if `split_scale` also selects the statistic that determines growth."""
         return False
 
     @override
@@ -307,17 +315,18 @@ def child_on_axis(
     length: Tensor | float,
     opacity: Tensor | float,
 ) -> dict[str, Tensor]:
-    """Return new values for one child of each parent [S], placed on the parent's longest axis.
+    """Return new values for one child of each parent [S], on the parent's longest axis.
 
     Args:
-        context: The step.
-        parents: Rows of the parents.
-        place: [S] offset of the child's centre from the parent's centre, in standard deviations on
-            the axis.
-        length: [S] logarithm of the ratio of the child's length on the axis to the parent's.
-        opacity: [S] logarithm of the ratio of the child's opacity to the parent's.
+        context: The context of the step.
+        parents: Indices of the parents.
+        place: [S] offset of the child's centre from the parent's centre along the axis, in standard
+            deviations.
+        length: [S] logarithm of the child's length divided by the parent's length, both along the
+            axis.
+        opacity: [S] logarithm of the child's opacity divided by the parent's opacity.
 
-    Source: fixed places on the longest axis as in Deng et al. 2024 (arXiv 2411.10133).
+    Source: Deng et al. 2024 (arXiv 2411.10133), fixed positions on the longest axis.
     """
     edited = ("means", "scales", "quats", "opacities")
     old = {name: context.parameters[name].detach()[parents] for name in edited}

@@ -1,4 +1,4 @@
-"""DC4GS: splits Gaussians whose gradient directions disagree, at the best plane between them."""
+"""DC4GS: splits Gaussians whose gradient directions disagree, at the best cut position."""
 
 import numpy as np
 import torch
@@ -10,15 +10,16 @@ from typing_extensions import override
 from crossgrad_core.plugin import DensifyContext, PluginState, Rows, screen_statistics
 from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth, Plan, child_on_axis
 
-#: Number of candidate planes across the longest axis: at -2, -1, 0, 1, 2 standard deviations.
+#: Number of candidate planes that cut the longest axis: at -2, -1, 0, 1, 2 standard deviations.
 PLANES = 5
 
 
 def inconsistency(sums: Tensor) -> Tensor:
-    """Return [N] (1 - R) ga of the pixels of each Gaussian.
+    """Return [N] the inconsistency (1 - R) ga of the pixels of each Gaussian.
 
-    R is the length of the mean direction, or 0 if there is no pixel. ga is the norm of the absolute
-    gradients. The result is 0 if all gradients have the same direction or if all are zero.
+    R is the length of the mean gradient direction, or 0 if there is no pixel. ga is the norm of the
+    sums of absolute gradients. The result is 0 if all gradients have one direction or if all are
+    zero.
 
     Args:
         sums: [5, N] fields of `Screen.directions`, summed over bins: direction (x, y), absolute
@@ -27,15 +28,15 @@ def inconsistency(sums: Tensor) -> Tensor:
     Source: DC4GS.
     """
     x, y, absolute_x, absolute_y, number = sums
-    # For a Gaussian without pixels, the factor is 1 - 0 / 1 and the gradient sum is 0. Rounding can
-    # make the mean longer than 1.
+    # For a Gaussian without pixels, the mean length is 0 / 1 and the gradient sum is 0, so the
+    # result is 0. Rounding can make the length of the mean larger than 1.
     rest = (1.0 - torch.sqrt(x * x + y * y) / number.clamp(min=1.0)).clamp(min=0.0)
     scores: Tensor = rest * torch.sqrt(absolute_x * absolute_x + absolute_y * absolute_y)
     return scores
 
 
 def plane_scores(bins: Tensor) -> Tensor:
-    """Return [5, N] mean of the inconsistencies on both sides of each plane.
+    """Return [5, N] the mean inconsistency of the two sides of each candidate plane.
 
     Args:
         bins: [6, 5, N] from `screen_statistics.directions`.
@@ -43,29 +44,29 @@ def plane_scores(bins: Tensor) -> Tensor:
     left, right = [bins[0]], [bins[-1]]
     for plane in range(1, PLANES):
         left.append(left[-1] + bins[plane])
-        # Sum the bins from the other end. The total minus the left side would leave rounding errors
-        # in empty bins.
+        # Sum the bins of the right side separately. The total minus the left side would contain
+        # rounding errors even if the right side is empty.
         right.append(right[-1] + bins[-1 - plane])
     sides = zip(left, reversed(right), strict=True)
     return torch.stack([(inconsistency(a) + inconsistency(b)) / 2.0 for a, b in sides])
 
 
-#: The positions of the candidate planes as shares of the axis, which is six standard deviations
-#: long.
+#: Positions of the candidate planes, as shares of the longest axis, which is six standard
+#: deviations long.
 NODES = np.arange(1, 6) / 6.0
-#: Further positions at which the polynomial is evaluated.
+#: Further positions at which the interpolation polynomial is evaluated.
 GRID = np.linspace(1.0 / 12.0, 11.0 / 12.0, 1000)
 
 
 def split_positions(scores: Tensor) -> Tensor:
-    """Return [S] share p of the axis for the left child, in [1/12, 11/12].
+    """Return [S] the best cut position: the left child's share p of the axis, in [1/12, 11/12].
 
-    The function searches for the minimum of the polynomial of degree 4 through the scores, on a
-    grid and at the nodes. Among equal values the most central one is used, so that equal scores
-    split in the middle.
+    A polynomial of degree 4 is fitted to the scores of the five planes. Its minimum is searched on
+    a grid and at the five planes. If several positions have the minimum, the most central position
+    is used.
 
     Args:
-        scores: [S, 5] of the planes at p = 1/6 .. 5/6, finite.
+        scores: [S, 5] finite scores of the planes at p = 1/6 .. 5/6.
 
     Source: DC4GS.
     """
@@ -76,7 +77,7 @@ def split_positions(scores: Tensor) -> Tensor:
 
 
 def _interpolation() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return positions [Q], central positions first, and the Lagrange weights [5, Q] there."""
+    """Return positions [Q], central positions first, and their Lagrange weights [5, Q]."""
     places = np.concatenate([NODES, GRID])
     places = places[np.argsort(np.abs(places - 0.5), kind="stable")]
     weights = np.ones((len(NODES), len(places)))
@@ -87,12 +88,13 @@ def _interpolation() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 class DirectionalConsistency(CloneSplit):
-    """Clones by the mean gradient, and splits by (1 - R) ga if gradient directions disagree.
+    """Clones by the mean gradient; splits by (1 - R) ga, large if gradient directions disagree.
 
-    R is the length of the mean direction of the pixels' gradients. ga is the norm of their absolute
-    values. Both are computed per view; the product (1 - R) ga is averaged over the renders in which
-    the Gaussian was visible. The children of a split are side by side on the longest axis. The cut
-    is at the position at which the gradients on each side of the cut agree most.
+    R is the length of the mean direction of the pixels' gradients, and ga is the norm of the sums
+    of their absolute values. R and ga are computed per view. The product (1 - R) ga is averaged
+    over the renders in which the Gaussian was visible. The two children of a split are next to each
+    other on the longest axis. The parent is cut at the position where the gradient directions agree
+    best on each side.
     """
 
     needs = frozenset({"directions"})
@@ -125,8 +127,8 @@ class DirectionalConsistency(CloneSplit):
         parting = screen_statistics.mean(state.per_primitive, "inconsistency", "renders")
         clone = (gradient >= self.grad_threshold) & small
         split = (parting >= self.split_threshold) & ~small
-        # Divide both criteria by their thresholds, so that clones and splits can be ranked together
-        # if the budget is short.
+        # Divide both criteria by their thresholds, so that clones and splits have comparable
+        # priorities.
         urge = torch.where(small, gradient / self.grad_threshold, parting / self.split_threshold)
         return Growth(clone=clone, split=split, strength=urge)
 
@@ -153,9 +155,9 @@ def _child(
 ) -> dict[str, Tensor]:
     """Return new values for the left or right children of parents [S], cut at `position` [S].
 
-    The longest axis is six standard deviations long. The left child gets the share p of the axis
-    and of the opacity. The centre of the child is 3 (1 - p) standard deviations left of the
-    parent's centre.
+    The longest axis is six standard deviations long. The left child gets the share p of the axis,
+    and the share p of the opacity. The centre of the left child is 3 (1 - p) standard deviations
+    left of the parent's centre.
     """
     share = 1.0 - position if right else position
     offset = 3.0 * (1.0 - share) * (1.0 if right else -1.0)

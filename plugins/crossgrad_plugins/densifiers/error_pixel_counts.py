@@ -1,4 +1,4 @@
-"""Counts of the erroneous pixels that each primitive is blended in, over several views (FastGS)."""
+"""Counts of the erroneous pixels of each primitive, over several views (FastGS)."""
 
 from abc import ABC
 from collections.abc import Sequence
@@ -20,13 +20,13 @@ from crossgrad_core.plugin import (
     unit_range,
 )
 
-#: Sums per primitive and regime [P, R]: marked pixels, marked pixels times the view's loss, and
-#: renders that showed the primitive.
+#: Names of the sums per primitive and regime [P, R]: erroneous pixels, erroneous pixels times the
+#: view's loss, and renders that showed the primitive.
 MARKED, ERROR, VISITS = "marked", "error", "visits"
 #: Number of rendered views of each regime.
 DRAWN = "drawn"
-#: Power of the number of renders in the rank of a primitive. A power of 0 gives a sum, and a power
-#: of 1 gives a mean.
+#: The rank of a primitive divides its sum by this power of the number of renders. Power 0 ranks by
+#: the sum, and power 1 ranks by the mean.
 VISITS_POWER = 0.75
 
 
@@ -35,8 +35,8 @@ class MultiViewScore:
     """The importance of P primitives in several views, per regime.
 
     Attributes:
-        marked: [P, R] erroneous pixels of the full photo, mean over views.
-        error: [P, R] erroneous pixels times the view's loss, mean over views.
+        marked: [P, R] number of erroneous pixels of the full photo, mean over views.
+        error: [P, R] number of erroneous pixels times the view's loss, mean over views.
         rank: [P, R] value by which the primitives of a regime are ranked.
     """
 
@@ -45,17 +45,17 @@ class MultiViewScore:
     rank: Tensor
 
     def above(self, threshold: float) -> Tensor:
-        """Return [P, R] bool: True if the whole number of erroneous pixels is above a threshold."""
+        """Return [P, R], True if the rounded-down number of pixels is above a threshold."""
         return self.marked.floor() > threshold
 
     def strength(self, grows: Tensor) -> Tensor:
-        """Return [P] the negative of the best rank of each growing primitive in any regime.
+        """Return [P] the priority of each growing primitive: minus its best rank in a regime.
 
-        The regimes alternate: first the best primitive of each regime, then the second of each, and
-        so on.
+        The regimes alternate: first the best primitive of each regime, then the second of each
+        regime, and so on.
 
         Args:
-            grows: [P, R] bool, primitives that grow.
+            grows: [P, R] bool, True for primitives that grow.
         """
         ranked = torch.where(grows, self.rank, -torch.inf)
         order = ranked.argsort(dim=0, descending=True, stable=True)
@@ -66,7 +66,7 @@ class MultiViewScore:
 
     @property
     def pruning_score(self) -> Tensor:
-        """The error [P], scaled to [0, 1] from smallest to largest; 0 if all errors are equal."""
+        """The error [P], scaled linearly to [0, 1]; 0 if all errors are equal."""
         error = self.error.sum(dim=1)
         if len(error) == 0:
             return error
@@ -78,9 +78,9 @@ class CountsMarkedPixels(Densifier, ABC):
     """A densifier that counts the erroneous pixels of each primitive over several views.
 
     A primitive's count is the number of erroneous pixels in which it is blended. The error of a
-    pixel is its absolute difference from the photo, averaged over channels and scaled to the range
-    of the view's errors. A pixel is erroneous if its error is above `error_threshold`. Counts are
-    in pixels of the full photo, at any scale of the render.
+    pixel is its absolute difference from the photo, averaged over channels. It is scaled to [0, 1]
+    by the smallest and largest error of the view. A pixel is erroneous if its error is above
+    `error_threshold`. At any scale of the render, counts are given in pixels of the full photo.
     """
 
     count: Literal["render", "running"] = Field(
@@ -110,7 +110,7 @@ class CountsMarkedPixels(Densifier, ABC):
     )
 
     def counted(self, context: DensifyContext, state: PluginState) -> PluginState:
-        """Return the counts, including the counts that are due in this step."""
+        """Return the counts after the counts of this step were added, if this step counts."""
         edits = context.schedule.densifies(context.step)
         if self.count == "render":
             return self.rendered(context) if edits else PluginState()
@@ -135,10 +135,10 @@ class CountsMarkedPixels(Densifier, ABC):
         return PluginState({DRAWN: numbers.tolist()}, per_primitive=sums)
 
     def importance_of(self, state: PluginState) -> MultiViewScore:
-        """Return the score of the counts of a state.
+        """Return the score that follows from the counts of a state.
 
-        A mean is taken over the views that were rendered for the counts. In the running variant the
-        mean is taken over the renders that showed the primitive.
+        Normally, the mean is taken over the views that were rendered for counting. With `count:
+        running`, the mean is taken over the training renders that showed the primitive.
         """
         marked, error, visits = (state.per_primitive[name] for name in (MARKED, ERROR, VISITS))
         drawn = state.values.get(DRAWN)
@@ -147,10 +147,10 @@ class CountsMarkedPixels(Densifier, ABC):
         return MultiViewScore(marked / per, error / per, rank)
 
     def idle_counting(self, *, renders: bool) -> dict[str, str]:
-        """Return the counting options that have no effect, with the reason.
+        """Return the counting options that have no effect, and the reasons.
 
         Args:
-            renders: True if the running variant also renders views.
+            renders: True if views are rendered for counting even with `count: running`.
         """
         if self.count == "render":
             return {"share": "count render selects its own views; leave the option out"}
@@ -158,7 +158,7 @@ class CountsMarkedPixels(Densifier, ABC):
         return {} if renders else {"views": why}
 
     def _sums(self, context: DensifyContext, state: PluginState) -> dict[str, Tensor]:
-        """Return copies of the sums [P, R], or zeros if there are none."""
+        """Return copies of the sums [P, R], or zeros if the state has no sums."""
         blocks, have = context.backbone.blocks(), state.per_primitive
         name = next(block.tensors[0] for block in blocks if block.per_primitive)
         like = context.parameters[name].detach()
@@ -166,7 +166,7 @@ class CountsMarkedPixels(Densifier, ABC):
         return {key: have.get(key, zeros).clone() for key in (MARKED, ERROR, VISITS)}
 
     def _regimes(self, context: DensifyContext) -> list[str]:
-        """Return the regimes that are counted separately."""
+        """Return the regimes whose pixels are counted separately."""
         names = {view.regime for view in context.scene.train_views} if self.regimes else {""}
         return sorted(names)
 
@@ -176,7 +176,7 @@ class CountsMarkedPixels(Densifier, ABC):
     def _add(
         self, context: DensifyContext, view: RenderedView, loss: float, sums: dict[str, Tensor]
     ) -> None:
-        """Add the counts of a view to the sums, in place."""
+        """Add the counts of a view to the sums in place."""
         if view.screen.count is None:
             raise RuntimeError(
                 "the rasterizer returned no pixel counts, although they were requested"
@@ -192,7 +192,7 @@ class CountsMarkedPixels(Densifier, ABC):
 
 
 def erroneous(view: RenderedView, threshold: float) -> Tensor:
-    """Return [H, W] bool: pixels whose error, scaled to the view's range, is above a threshold.
+    """Return [H, W], True for pixels whose error, scaled to the view's range, is too large.
 
     The error is the absolute difference from the photo, averaged over channels. Masked pixels are
     never erroneous. If all pixels have the same error, no pixel is erroneous.
@@ -210,11 +210,11 @@ def erroneous(view: RenderedView, threshold: float) -> Tensor:
 
 
 def drawn_views(columns: Sequence[int], number: int, rng: np.random.Generator) -> list[int]:
-    """Return random different views, evenly from all groups and at least one from each group.
+    """Return random different views: equally many from all groups, at least one from each.
 
     Args:
-        columns: The group of each view, counted from 0.
-        number: Number of views.
+        columns: Index of the group of each view.
+        number: Number of views to draw.
         rng: Random generator.
     """
     groups = max(columns) + 1

@@ -1,4 +1,4 @@
-"""3DGS-MCMC: relocation, slow growth to a cap, noise and regularisers (Kheradmand et al. 2024)."""
+"""3DGS-MCMC: relocation, growth to a cap, noise and regularisers (Kheradmand et al. 2024)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -28,37 +28,41 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: Steepness of the gate for the noise, and opacity at which the gate is half open (3DGS-MCMC).
+#: Steepness of the sigmoid that gates the noise, and the opacity at which the gate is 1/2
+#: (3DGS-MCMC).
 GATE_STEEPNESS = 100.0
 GATE_OPACITY = 0.005
-#: Shifts below this share of a Gaussian's size are skipped, because float32 cannot represent them.
+#: Shifts below this share of a Gaussian's largest scale are skipped, because float32 hardly
+#: represents them.
 NEGLIGIBLE = 1e-7
 
 
 def position_noise(
     parameters: Mapping[str, Tensor], strength: float, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Return the rows of `means` that noise moves, and their shifts.
+    """Return the rows of `means` that noise moves, and the shifts of these rows.
 
-    shift = Sigma n sig(-100 (o - 0.005)) strength, with n three standard normal numbers. No number
-    is drawn for a Gaussian that would move by less than 1e-7 of its largest scale. Every opaque
-    Gaussian moves by less than that, so the noise costs little after the first steps of training.
+    shift = strength Sigma n sigmoid(-100 (o - 0.005)). Sigma is the covariance, o is the opacity,
+    and n are three standard normal numbers. No number is drawn for a Gaussian that would move by
+    less than 1e-7 of its largest scale. Opaque Gaussians move by less than this limit, so the noise
+    costs little time after the first steps.
 
     Args:
         parameters: Parameters with `scales` (log) [N, 3], `quats` [N, 4] and `opacities` (logit)
             [N].
-        strength: Learning rate of the positions times the noise's own factor, 1 / local units.
+        strength: Learning rate of the positions times the factor of the noise, 1 / local units.
         rng: Random generator.
 
     Returns:
-        Rows [R] int64 and shifts [R, 3], local units.
+        Indices [R] int64 of the moved rows, and their shifts [R, 3] in local units.
 
     Source: Kheradmand et al. 2024 (3DGS-MCMC), eq. 8.
     """
     log_scales = parameters["scales"].detach()
     opacity = sigmoid(parameters["opacities"].detach())
     factor = strength * sigmoid(GATE_STEEPNESS * (GATE_OPACITY - opacity))
-    # Process column by column, because reducing rows of three is much slower on the CPU.
+    # Process the three columns separately, because reductions over rows of three are slow on the
+    # CPU.
     a, b, c = log_scales.unbind(1)
     largest = torch.exp(torch.maximum(torch.maximum(a, b), c))
     rows = (factor * largest > NEGLIGIBLE).nonzero().squeeze(1)
@@ -73,7 +77,8 @@ def position_noise(
 def rotated(vectors: Tensor, quats: Tensor, *, back: bool = False) -> Tensor:
     """Return vectors [R, 3] rotated by unit quaternions wxyz [R, 4], or by their inverses.
 
-    The formula is v + w t + u x t with t = 2 u x v, without matrices.
+    With quaternion (w, u) and vector v, the formula is v + w t + u x t with t = 2 u x v. It needs
+    no matrices.
     """
     w, u = quats[:, :1], quats[:, 1:]
     turned: Tensor = 2.0 * torch.linalg.cross(u, vectors)
@@ -81,46 +86,47 @@ def rotated(vectors: Tensor, quats: Tensor, *, back: bool = False) -> Tensor:
     return along - w * turned if back else along + w * turned
 
 
-#: Maximum number of copies that is used in the formula (the published bound).
+#: Maximum number n of copies for which the formula is evaluated (the published bound).
 MOST_COPIES = 51
-#: Step of the quadrature, in standard deviations. The integrand is entire, so the relative error of
-#: the trapezoidal rule is exp(-c / step). For 51 opaque copies it is 2e-12 at step 0.2, and below
-#: the rounding error at step 0.15.
+#: Step of the numerical integration, in standard deviations. The integrand is an entire function,
+#: so the relative error of the trapezoidal rule decreases as exp(-c / step). For 51 opaque copies,
+#: the error is 2e-12 at step 0.2. At step 0.15, it is below the rounding error.
 _STEP = 0.15
-#: Number of steps. At 9.6 standard deviations, the integrand of 51 copies is below 1e-18.
+#: Number of steps of the integration. The steps reach 9.6 standard deviations, where the integrand
+#: of 51 copies is below 1e-18.
 _STEPS = 64
 
 
 def shared_opacity(opacity: Tensor, copies: Tensor) -> Tensor:
-    """Return the opacity of each of n copies that together are as opaque as one: 1 - (1 - o)^(1/n).
+    """Return the opacity of n copies that together are as opaque as one: 1 - (1 - o)^(1/n).
 
     Args:
-        opacity: [R] float64 in [0, 1].
-        copies: [R] n >= 1.
+        opacity: [R] float64 opacity o of the original, in [0, 1].
+        copies: [R] number n of copies, at least 1.
     """
     return -torch.expm1(torch.log1p(-opacity) / copies)
 
 
 def shared_scale(opacity: Tensor, copies: Tensor) -> Tensor:
-    """Return the factor of the scales of n copies, so that together they are as wide as one.
+    """Return the factor of the scales with which n copies together are as wide as the original.
 
-    o' is the shared opacity. The published factor is o / D with the alternating sums D =
-    sum_{i=1..n} sum_{q<i} C(i-1, q) (-1)^q o'^(q+1) / sqrt(q+1). For many opaque copies, these sums
-    lose all precision by cancellation. But 1 / sqrt(q+1) is the integral of a Gaussian to the power
-    q+1, and the sums have a closed form under the integral:
+    Let o be the original opacity and o' the opacity of each copy (`shared_opacity`). The published
+    factor is o / D with the alternating sums D = sum_{i=1..n} sum_{q<i} C(i-1, q) (-1)^q o'^(q+1) /
+    sqrt(q+1). For many opaque copies, the alternating sums lose all precision by cancellation. But
+    1 / sqrt(q+1) is an integral over exp(-x^2/2) to the power q+1. With the sums inside the
+    integral,
 
         D = 1/sqrt(2 pi) int 1 - (1 - o' exp(-x^2/2))^n dx.
 
-    This integrand is positive and smooth. The trapezoidal rule integrates this function with an
-    error as small as rounding.
+    The integrand is positive and smooth. The trapezoidal rule therefore integrates it up to
+    rounding errors.
 
     Args:
-        opacity: [R] float64 in [0, 1], before it is shared.
-        copies: [R] 1 <= n <= 51.
+        opacity: [R] float64 opacity o of the original, in [0, 1].
+        copies: [R] number n of copies, 1 to 51.
 
     Returns:
-        [R] in (0, 1]. If the opacity is 0 or below the smallest normal number, the result is the
-        limit 1.
+        [R] factors in (0, 1]. If the opacity is 0 or subnormal, the result is the limit 1.
     """
     nodes = _STEP * torch.arange(_STEPS + 1, dtype=opacity.dtype, device=opacity.device)
     weights = torch.full_like(nodes, 2.0 * _STEP / sqrt(2.0 * pi))
@@ -133,13 +139,13 @@ def shared_scale(opacity: Tensor, copies: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Pool:
-    """A set of primitives, some of which are copies of others.
+    """A list of primitives that can contain several copies of one original.
 
     Attributes:
-        source: [M] int64, index of the old primitive of each primitive.
-        opacity: [M] float64.
-        scale: [M] float64, factor of the scales.
-        touched: [M] bool, True if the primitive shares its source with other primitives.
+        source: [M] int64 index of the original of each primitive.
+        opacity: [M] float64 opacity of each primitive.
+        scale: [M] float64 factor of the scales of each primitive.
+        touched: [M] bool, True if another primitive has the same original.
     """
 
     source: Tensor
@@ -149,16 +155,18 @@ class Pool:
 
     @classmethod
     def of(cls, opacity: Tensor) -> "Pool":
-        """Return the pool of the present primitives with opacities [M] (float64)."""
+        """Return the pool of the present primitives, with opacities [M] (float64)."""
         source = torch.arange(opacity.shape[0], device=opacity.device)
         untouched = torch.zeros_like(source, dtype=torch.bool)
         return cls(source, opacity, torch.ones_like(opacity), untouched)
 
     def copied(self, index: Tensor, lowest: float) -> "Pool":
-        """Return the primitives at `index` [M']; repeated primitives share their opacity.
+        """Return the primitives at `index` [M'].
+
+        Primitives that occur several times share their opacity.
 
         Args:
-            index: [M'] int64.
+            index: [M'] int64 indices; an index may occur several times.
             lowest: Lower bound of a shared opacity; the upper bound is 1 minus the float32 epsilon.
         """
         copies = torch.bincount(index, minlength=self.source.shape[0]).clamp(max=MOST_COPIES)
@@ -171,16 +179,16 @@ class Pool:
         return Pool(self.source[index], opacity[index], scale[index], touched[index])
 
 
-#: Relocation and growth end after 25,000 of 30,000 steps, as published.
+#: Relocation and growth end after the share 25,000 / 30,000 of the steps, as published.
 LAST_EDIT_SHARE = 25 / 30
 
 
 class MarkovChainMonteCarlo(Densifier):
-    """Moves transparent Gaussians onto opaque ones, and adds 5 % per pass up to a cap.
+    """Moves transparent Gaussians onto opaque ones, and adds 5 % per edit up to a cap.
 
-    The densifier needs no screen statistics. Gaussians are samples of a distribution that training
-    explores by noise on the positions. Two regularisers make useless Gaussians transparent and
-    small. The densifier does not clone, split, prune or reset opacities.
+    The densifier needs no screen statistics. Noise on the positions makes the Gaussians explore
+    space like samples of a distribution. Two regularisers make Gaussians without use transparent
+    and small. The densifier does not clone, split, prune or reset opacities.
     """
 
     tensors = frozenset({"means", "scales", "quats", "opacities"})
@@ -234,7 +242,7 @@ class MarkovChainMonteCarlo(Densifier):
 
     @hookimpl
     def crossgrad_after_step(self, context: AfterStepContext) -> DensifyResult | None:
-        """Move the positions by noise and keep the moments."""
+        """Add noise to the positions; the optimizer's moments do not change."""
         strength = self.noise * context.means_lr
         rows, shifts = position_noise(context.parameters, strength, context.rng)
         if rows.shape[0] == 0:
@@ -252,7 +260,7 @@ class MarkovChainMonteCarlo(Densifier):
         return RegularizeResult(opacity + self.scale_weight * torch.exp(scales).mean())
 
     def _relocated(self, pool: Pool, rng: np.random.Generator) -> tuple[Pool, int]:
-        """Return the pool with dead primitives moved onto live ones, and their number."""
+        """Move dead primitives onto live primitives; return the pool and the number moved."""
         dead = pool.opacity <= self.dead_opacity
         live = (~dead).nonzero().squeeze(1)
         moved = int(dead.sum())
@@ -263,7 +271,7 @@ class MarkovChainMonteCarlo(Densifier):
         return pool.copied(index, self.dead_opacity), moved
 
     def _grown(self, pool: Pool, added: int, rng: np.random.Generator) -> Pool:
-        """Return the pool with `added` copies; unchanged if no primitive can be copied."""
+        """Return the pool with `added` copies; it is unchanged if no primitive can be copied."""
         if added == 0 or not bool((pool.opacity > 0.0).any()):
             return pool
         index = torch.arange(pool.opacity.shape[0], device=pool.opacity.device)
@@ -279,7 +287,7 @@ def drawn(weights: Tensor, number: int, rng: np.random.Generator) -> Tensor:
 
 
 def _edit_of(pool: Pool, log_scales: Tensor, counts: dict[str, int]) -> Edit:
-    """Return the pool as an edit; primitives that share a source start with zero moments."""
+    """Return the edit that creates the pool; copies and their originals get zero moments."""
     if not bool(pool.touched.any()):
         return Edit(counts=counts) if any(counts.values()) else NO_EDIT
     rows = pool.touched.nonzero().squeeze(1)

@@ -28,19 +28,19 @@ from crossgrad_plugins.densifiers.error_pixel_counts import CountsMarkedPixels
 
 #: Shortest interval between edits, in views (the published interval of the larger variant).
 SHORTEST_INTERVAL = 100
-#: Key of the number of completed late prunings.
+#: Key of the number of late prunings that have been done.
 LATE = "late"
 
 
 class MultiViewDensityControl(CountsMarkedPixels, AxisSplit):
-    """Clones and splits by the errors of several views; prunes by these errors, early and late.
+    """Clones, splits and prunes by the errors of several views, also after density control ends.
 
-    A Gaussian may grow if it is blended in more than `importance` erroneous pixels of a view on
-    average. A primitive is cloned by the norm of its mean gradient, and split by the norm of its
-    absolute gradient. Only a share of the usual pruning candidates is removed. A candidate is drawn
-    with a weight that increases with its share in the error. After density control has ended,
-    Gaussians that are faint or have nearly the largest error are removed at some points of the run.
-    For anchors, use the densifier `multiview-gate`.
+    A Gaussian may grow if it is blended in more than `importance` erroneous pixels per view on
+    average. Clones are selected by the norm of the mean gradient, and splits by the norm of the
+    absolute gradients. Only a random share of the usual pruning candidates is removed. The
+    probability of a candidate increases with its share in the errors. After density control has
+    ended, late prunings remove Gaussians that are faint or have nearly the largest error. For
+    anchors, use the densifier `multiview-gate`.
     """
 
     needs = frozenset({"abs_gradient", "count"})
@@ -131,9 +131,9 @@ class MultiViewDensityControl(CountsMarkedPixels, AxisSplit):
         return edit, state
 
     def _capped(self, context: DensifyContext, edit: Edit) -> Edit:
-        """Return the edit with opacities limited to the cap; lower opacities keep their moments."""
+        """Limit the opacities of an edit to the cap; lower opacities keep their Adam moments."""
         if self.cap_opacity == 1.0 or "opacities" in edit.values:
-            return edit  # An opacity reset uses a lower cap.
+            return edit  # Opacities are limited to a lower cap if this edit also resets opacities.
         after = edited_parameters(context, edit)
         capped = context.backbone.capped_opacities(after, self.cap_opacity)
         rows = (capped < after["opacities"].detach()).nonzero().squeeze(1)
@@ -145,7 +145,7 @@ class MultiViewDensityControl(CountsMarkedPixels, AxisSplit):
     def _pruned_late(self, context: DensifyContext, state: PluginState) -> tuple[Edit, PluginState]:
         """Remove faint primitives and primitives with nearly the largest error.
 
-        This happens only in steps in which late pruning is due.
+        Nothing is removed in steps without a late pruning.
         """
         schedule = context.schedule
         reached = schedule.counted(context.step) / schedule.length
@@ -164,10 +164,11 @@ class MultiViewDensityControl(CountsMarkedPixels, AxisSplit):
 
 
 def some_of(candidates: Tensor, score: Tensor, share: float, rng: np.random.Generator) -> Tensor:
-    """Return [M] bool: a share of the candidates [M], rounded up, drawn without replacement.
+    """Return [M], True for a random share of the candidates [M], drawn without replacement.
 
-    Candidates are drawn one by one with probability proportional to 1 / (1 - score). Sorting
-    exponential random numbers times 1 - score gives the same order (Efraimidis and Spirakis 2006).
+    Candidates are drawn one by one with probabilities proportional to 1 / (1 - score). The
+    implementation sorts exponential random numbers times 1 - score, which gives the same
+    distribution (Efraimidis and Spirakis 2006).
     """
     rows = candidates.nonzero().squeeze(1)
     weight = 1.0 - score[rows].double().cpu().numpy()

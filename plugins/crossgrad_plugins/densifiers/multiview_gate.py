@@ -1,4 +1,4 @@
-"""A gate around another densifier: errors of several views decide which primitives may grow."""
+"""A wrapper around another densifier: only primitives with errors in several views may grow."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -24,15 +24,15 @@ from crossgrad_core.plugin import (
 )
 from crossgrad_plugins.densifiers.error_pixel_counts import CountsMarkedPixels
 
-#: Prefix of the names in the state of the gate. It separates these names from the names of the
-#: wrapped densifier.
+#: Prefix of the names of the gate's own values in the state. It separates these values from the
+#: values of the wrapped densifier.
 OWN = "gate/"
-#: Hooks of the wrapped densifier that the gate implements for it.
+#: Hooks of the wrapped densifier that the gate calls itself.
 _ANSWERED = frozenset({"crossgrad_densify", "crossgrad_validate_selection"})
 
 
 def densifier_of(value: object) -> Densifier:
-    """Return a densifier from itself, from its name, or from `{name: ..., option: ...}`."""
+    """Return a densifier from a densifier, a name, or a mapping `{name: ..., option: ...}`."""
     if not isinstance(value, Densifier):
         choice = {"name": value} if isinstance(value, str) else value
         if not isinstance(choice, Mapping) or "name" not in choice:
@@ -49,11 +49,12 @@ def densifier_of(value: object) -> Densifier:
 
 
 class MultiViewGate(CountsMarkedPixels):
-    """A densifier that lets another densifier grow only primitives with errors in several views.
+    """Lets another densifier grow only primitives that have errors in several views.
 
-    A primitive may grow if its Gaussians are blended in more than `importance` erroneous pixels of
-    a view on average. The other densifier decides how a primitive grows and which primitives are
-    pruned: `anchor` or `octree` for anchors, any densifier that clones and splits for Gaussians.
+    A primitive may grow if its Gaussians are blended in more than `importance` erroneous pixels per
+    view on average. The option `of` names the other densifier, which decides how a primitive grows
+    and which primitives are pruned. For anchors, use `anchor` or `octree`; for Gaussians, use any
+    densifier that clones and splits.
     """
 
     of: Annotated[Densifier, BeforeValidator(densifier_of), PlainSerializer(plain_component)] = (
@@ -63,29 +64,29 @@ class MultiViewGate(CountsMarkedPixels):
     @property
     @override
     def needs(self) -> frozenset[str]:  # type: ignore[override]
-        """The statistics that the other densifier needs, and the count."""
+        """The statistics that the wrapped densifier needs, and the pixel count of the gate."""
         return self.of.needs | {"count"}
 
     @property
     @override
     def tensors(self) -> frozenset[str]:  # type: ignore[override]
-        """The tensors that the other densifier edits."""
+        """The tensors that the wrapped densifier edits."""
         return self.of.tensors
 
     @property
     @override
     def resets(self) -> bool:  # type: ignore[override]
-        """True if the other densifier resets opacities."""
+        """True if the wrapped densifier resets opacities."""
         return self.of.resets
 
     @property
     @override
     def observes(self) -> bool:  # type: ignore[override]
-        """True if the gate or the other densifier gathers statistics of views."""
+        """True if the gate or the wrapped densifier collects statistics of views."""
         return self.count == "running" or self.of.observes
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """Return the options without an effect; see `HasUnusedOptions`."""
+        """Return the options that have no effect; see `HasUnusedOptions`."""
         idle = self.idle_counting(renders=False)
         inner = set_for_nothing(self.of, replace(selection, densifier=self.of))
         if inner:
@@ -115,7 +116,7 @@ class MultiViewGate(CountsMarkedPixels):
         return edit, _joined(gate, inner)
 
     def _check(self, edit: Edit, may_grow: Tensor) -> None:
-        """Raise an error if a primitive grew that may not grow."""
+        """Raise an error if the wrapped densifier grew a primitive that may not grow."""
         if edit.source is None or edit.fresh is None:
             return
         if not bool(may_grow[edit.source[edit.fresh]].all()):
@@ -130,7 +131,7 @@ class MultiViewGate(CountsMarkedPixels):
 
 
 def _parted(state: PluginState) -> tuple[PluginState, PluginState]:
-    """Return the gate's part of a state and the other densifier's part."""
+    """Split a state into the values of the gate and the values of the wrapped densifier."""
     gate, inner = (
         {
             field: {
@@ -146,6 +147,6 @@ def _parted(state: PluginState) -> tuple[PluginState, PluginState]:
 
 
 def _joined(gate: PluginState, inner: PluginState) -> PluginState:
-    """Return one state that contains both parts."""
+    """Join the values of the gate and of the wrapped densifier in one state."""
     per_primitive = {OWN + name: rows for name, rows in gate.per_primitive.items()}
     return replace(inner, per_primitive={**inner.per_primitive, **per_primitive})

@@ -8,7 +8,7 @@ from crossgrad_core.plugin import NO_EDIT, Densifier, DensifyContext, Edit, Plug
 
 
 class NoDensification(Densifier):
-    """A densifier that never edits and needs no statistics."""
+    """Never edits the primitives, and needs no statistics."""
 
     edits: ClassVar[bool] = False
     resets: ClassVar[bool] = False

@@ -10,13 +10,13 @@ from crossgrad_plugins.densifiers.clone_split import AxisSplit, Growth
 
 
 class PixelDensityControl(AxisSplit):
-    """Adaptive density control whose statistic is weighted by pixels and scaled by depth.
+    """Adaptive density control whose gradients are weighted by pixels and scaled by depth.
 
-    A render in which a Gaussian fills many pixels has a larger weight. The statistic is sum(m f
+    A render in which a Gaussian covers many pixels gets a large weight. The statistic is sum(m f
     |g|) / sum(m). m is the number of pixels in which the Gaussian was blended, and g the NDC
     gradient of its projected mean. f = min(1, (z / depth_threshold)^2) with the depth z of the
     centre reduces the growth of floaters in front of a camera. Only this statistic is scaled; the
-    gradients for training are not scaled. Source: Pixel-GS.
+    gradients for training are unchanged. Source: Pixel-GS.
     """
 
     needs = frozenset({"pixels"})
@@ -44,13 +44,14 @@ class PixelDensityControl(AxisSplit):
         return PluginState(per_primitive=totals)
 
     def _nearness(self, record: ViewRecord) -> Tensor:
-        """Return [N] in [0, 1], the factor f of each Gaussian in this view."""
+        """Return [N] the factor f of each Gaussian in this view, in [0, 1]."""
         means = record.gaussians.means
         pose = record.view.camera.world_to_camera.to(means, non_blocking=True)
         x, y, z = means.unbind(1)
         # Do not use a matrix product, because its rounding depends on the number of threads.
         depths = x * pose[2, 0] + y * pose[2, 1] + z * pose[2, 2] + pose[2, 3]
-        # The unit of the local frame is the extent of the training cameras.
+        # The unit of the local frame is the extent of the training cameras, so no conversion is
+        # needed.
         return (depths / self.depth_threshold).square().clamp(max=1.0)
 
     @override

@@ -1,4 +1,4 @@
-"""Revising Densification: growth at large image errors (Rota Bulò et al. 2024, 2404.06109)."""
+"""Revising Densification: growth at large image errors (Rota Bulò et al. 2024)."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -31,7 +31,7 @@ ErrorKind = Literal["ssim", "l1"]
 
 
 def spread_views(number: int, most: int, rng: np.random.Generator) -> list[int]:
-    """Return at most `most` of `number` views: a random view from each of `most` equal ranges."""
+    """Return at most `most` indices below `number`: a random one from each of equal ranges."""
     if number <= most:
         return list(range(number))
     edges = np.linspace(0, number, most + 1).astype(np.int64)
@@ -39,14 +39,14 @@ def spread_views(number: int, most: int, rng: np.random.Generator) -> list[int]:
 
 
 def largest_shares(context: DensifyContext, views: Iterable[int], kind: ErrorKind) -> Tensor:
-    """Return [P], the largest share of each primitive in the error of any view, in pixels.
+    """Return [P] the largest share of each primitive in the error of any view, in pixels.
 
-    The views are rendered with the current parameters and the exposure. This costs two renders and
-    one backward pass per view.
+    The views are rendered with the current parameters and the predicted exposure. Each view costs
+    two renders and one backward pass.
 
     Args:
-        context: The step, with the parameters and the rasterizer.
-        views: Positions in `scene.train_views`.
+        context: The context of the step, with the parameters and the rasterizer.
+        views: Indices in `scene.train_views`.
         kind: The kind of pixel error.
     """
     blocks = context.backbone.blocks()
@@ -67,12 +67,12 @@ def largest_shares(context: DensifyContext, views: Iterable[int], kind: ErrorKin
 
 
 def pixel_error(image: Tensor, decoded: tuple[Tensor, Tensor | None], kind: ErrorKind) -> Tensor:
-    """Return [H, W] error of each pixel, mean over channels; 0 where the photo is masked out.
+    """Return [H, W] error of each pixel, mean over channels; masked pixels have error 0.
 
     Args:
         image: [H, W, 3], the render of the view.
-        decoded: [H, W, 3] uint8 photo and [H, W] bool mask (None if every pixel counts), on the
-            image's device.
+        decoded: The photo, [H, W, 3] uint8, and its mask, [H, W] bool or None, on the device of the
+            image.
         kind: 1 - SSIM (in [0, 2]) or the absolute difference.
     """
     photo, mask = decoded
@@ -84,8 +84,9 @@ def pixel_error(image: Tensor, decoded: tuple[Tensor, Tensor | None], kind: Erro
 def _shares(context: DensifyContext, gaussians: Gaussians, camera: Camera, error: Tensor) -> Tensor:
     """Return [N] sums over pixels of the Gaussian's blending weight times the pixel's error.
 
-    The value of a pixel is the sum of weight times colour. The result is therefore a gradient with
-    respect to the colour of one channel: the gradient of the sum over pixels of image times error.
+    The rasterizer renders each pixel as the sum of blending weight times colour. The result is
+    therefore the gradient of the sum of image times error, with respect to one colour channel of
+    each Gaussian.
     """
     colors = torch.zeros_like(gaussians.means, requires_grad=True)
     plain = replace(gaussians, colors=colors, sh_dc=None, sh_rest=None, sh_degree=0)
@@ -96,7 +97,7 @@ def _shares(context: DensifyContext, gaussians: Gaussians, camera: Camera, error
     return gradient[:, 0]
 
 
-#: Density control ends after 27,000 of 30,000 steps, as published.
+#: Density control ends after the share 27,000 / 30,000 of the steps, as published.
 LAST_EDIT_SHARE = 27 / 30
 #: Opacities are not lowered below this value.
 LEAST_OPACITY = 1e-6
@@ -106,11 +107,12 @@ _FAINT = -15.0
 
 
 class RevisingDensification(CloneSplit):
-    """Clones and splits the Gaussians that have the largest share in the error of some view.
+    """Clones and splits the Gaussians that have the largest share in the error of a view.
 
-    The share is measured when an edit is due. The measurement uses the current parameters and views
-    that are spread over the training views. Clones and children share their opacity. Instead of
-    opacity resets, every edit decreases all opacities a little.
+    The share is measured just before an edit. The measurement uses the current parameters, and
+    views that are evenly spread over the training views. A clone and its original share the opacity
+    of the original, and so do the children of a split. Instead of opacity resets, every edit
+    decreases all opacities slightly.
     """
 
     observes: ClassVar[bool] = False
@@ -172,13 +174,19 @@ class RevisingDensification(CloneSplit):
 
 
 def halved_logits(logits: Tensor) -> Tensor:
-    """Return logits [R] of o' = 1 - sqrt(1 - o); two copies with o' are as opaque as one."""
+    """Return logits [R] of the opacity o' = 1 - sqrt(1 - o).
+
+    Two copies with opacity o' are as opaque as one Gaussian with opacity o.
+    """
     transparency = logsigmoid(-logits) / 2  # This is the logarithm of sqrt(1 - o).
     shared = torch.log(-torch.expm1(transparency)) - transparency
     return torch.where(logits < _FAINT, logits - log(2.0), shared)
 
 
 def lowered_logits(logits: Tensor, decrease: float) -> Tensor:
-    """Return logits [P] of opacities minus `decrease`; no opacity is raised to the minimum."""
+    """Return logits [P] of the opacities minus `decrease`.
+
+    An opacity below the minimum is not raised.
+    """
     lowered = (sigmoid(logits) - decrease).clamp(min=LEAST_OPACITY)
     return torch.minimum(logits, torch.logit(lowered))

@@ -1,4 +1,4 @@
-"""The command `crossgrad diagnose`: a model, its probes and the report."""
+"""The command `crossgrad diagnose`: choose a model, measure its gradients, write the report."""
 
 import sys
 from collections.abc import Mapping
@@ -51,16 +51,17 @@ from crossgrad_plugins.diagnostics.watch import Watch
 
 @dataclass(frozen=True)
 class Options:
-    """How a scene is diagnosed.
+    """Options of a diagnosis.
 
     Attributes:
-        grouping: The grouping; None for the run's grouping, or else the grouping of the paper.
-        per_group: Probed views per group.
+        grouping: The grouping; None for the run's grouping, or, without one, the grouping of the
+            paper.
+        per_group: Number of probed views per group; a probe measures the gradients of these views.
         probes: Number of probes during the vanilla run, evenly spaced; the last probe is at its
             end.
         seconds: Training seconds of the vanilla run.
         seed: Seed of the vanilla run and of the probes.
-        signature: File for the labels of grouping `conflict-signature`, or None.
+        signature: Output file for the labels of grouping `conflict-signature`, or None.
     """
 
     grouping: ComponentChoice | None = None
@@ -82,19 +83,20 @@ def diagnose(
     """Diagnose a scene or a run, print the report, and write it to a folder.
 
     Args:
-        scene: Scene folder; the bundled scene if neither a scene nor a run is given.
-        run: Folder of a run to probe, or None.
-        settings: Settings of the vanilla run in the format of `RunConfig` (data, device ...). For
-            a run, only `device` and `threads` can be set.
-        options: The options of the probes.
+        scene: Scene folder; the bundled scene is used if neither a scene nor a run is given.
+        run: Folder of a run whose gradients are measured, or None.
+        settings: Settings of the vanilla run in the format of `RunConfig` (data, device ...). If a
+            run is given, only `device` and `threads` may be set.
+        options: The options of the diagnosis.
         out: Output folder of the report.
-        accept_scene: For a run: accept its scene even if parts of the scene have changed.
+        accept_scene: True to accept a run's scene even if parts of the scene have changed.
 
     Returns:
-        The exit code: 0, or 1 if training failed; the probes before the failure are reported.
+        The exit code: 0, or 1 if training failed. After a failure, the report contains the probes
+            before it.
 
     Raises:
-        UserError: The input is invalid.
+        UserError: The options, the scene or the run cannot be used.
     """
     if scene is not None and run is not None:
         raise UserError(
@@ -149,19 +151,22 @@ def _write(report: Report, folder: Path) -> None:
 
 
 def diagnose_scene(config: RunConfig, options: Options) -> Report:
-    """Train a short vanilla run (one view per step, epoch order, plain sum) and probe it.
+    """Train a short vanilla run and measure its gradients.
+
+    A vanilla run has one view per step, epoch order and the plain sum of gradients.
 
     Args:
-        config: Scene, data options, device and threads; components are replaced.
-        options: The options of the probes.
+        config: Scene, data options, device and threads; its components are replaced by those of a
+            vanilla run.
+        options: The options of the diagnosis.
 
     Returns:
-        The report. If training failed after the first probe, the report contains the probes before
-        the failure, and `failure` describes the failure.
+        The report. If training fails after the first probe, the report contains the earlier probes,
+        and `failure` describes the failure.
 
     Raises:
-        UserError: The scene cannot be read, has too few training photos, or the grouping cannot
-            group it.
+        UserError: The scene cannot be read, has too few training photos, or cannot be divided by
+            the grouping.
         TrainingFailedError: Training failed before the first probe.
     """
     vanilla = config.model_copy(
@@ -193,10 +198,11 @@ def diagnose_scene(config: RunConfig, options: Options) -> Report:
 
 
 def diagnose_run(setup: Setup, state: TrainState, folder: Path, options: Options) -> Report:
-    """Probe a run at its current step.
+    """Measure the gradients of a run at its current step.
 
     Raises:
-        UserError: The run's scene has too few training photos, or the grouping cannot group it.
+        UserError: The scene of the run has too few training photos, or cannot be divided by the
+            grouping.
     """
     plan = _plan(setup.scene, options, setup.groups)
     watch = Watch(plan, 1, state.step, options.seed)
@@ -211,7 +217,7 @@ def diagnose_run(setup: Setup, state: TrainState, folder: Path, options: Options
 
 
 def _plan(scene: Scene, options: Options, groups: tuple[str, ...] | None = None) -> ProbePlan:
-    """Choose the views to probe; `groups` are the labels that the probed run was trained with."""
+    """Choose the views to probe; `groups` are the labels from the training of the run."""
     require_views(scene)
     if options.grouping is None and groups is not None:
         return plan_probe(scene, OF_THE_RUN, groups, options.per_group, options.seed)
@@ -232,7 +238,7 @@ def _report(which: str, watch: Watch, model: Model, options: Options) -> Report:
 
 
 def _write_signature(model: Model, path: Path, seed: int) -> str:
-    """Write the labels of `conflict-signature` to a file for grouping `lists`; return a note."""
+    """Write the labels of `conflict-signature` for grouping `lists`, and return a note."""
     scene = model.scene
     grouping = build(Grouping, "conflict-signature", {})
     rng = np.random.default_rng(seed)

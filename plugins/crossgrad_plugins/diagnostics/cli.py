@@ -1,4 +1,4 @@
-"""`crossgrad diagnose`: regimes, bimodality, gradient conflict, variance split."""
+"""`crossgrad diagnose`: regimes, bimodality, gradient conflict and variance split."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -120,7 +120,7 @@ def diagnose(given: Given) -> None:
 
 
 def _refuse_idle(idle: list[str], run: Path | None) -> None:
-    """Refuse options that have no effect on the diagnosed scene or run."""
+    """Refuse options that have no effect in this diagnosis."""
     if idle:
         why = (
             "without --run" if run is None else "with --run: a run is probed once, without training"

@@ -1,4 +1,4 @@
-"""Gradient conflict of views against the difference of their distances."""
+"""The relation between the gradient conflict of two views and the difference of their distances."""
 
 from dataclasses import dataclass
 
@@ -6,26 +6,27 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
-#: Two correlations are treated as equal if their difference is below this value.
+#: Two correlations count as equal if they differ by less than this value.
 _ROUNDING = 1e-9
-#: Number of decimals of a difference of logarithms that are kept. Further decimals are rounding
-#: errors.
+#: Number of decimals to which differences of logarithms are rounded. Further decimals contain only
+#: rounding errors.
 _DIGITS = 9
-#: Number of bins of photo pairs. The pairs are binned by the difference of their distances.
+#: Number of bins of photo pairs. Pairs are sorted into bins by the difference of the two views'
+#: distances.
 _BINS = 4
 
 
 @dataclass(frozen=True, eq=False)
 class DistanceConflict:
-    """Gradient conflict of pairs of views against the difference of their distances.
+    """The relation between conflict of two views and the difference of their distances.
 
     Attributes:
-        rates: [4] conflict rate of the pairs in each quarter by |log r_i - log r_j|; NaN for an
-            empty quarter.
-        correlation: Rank correlation (Spearman) of conflict with |log r_i - log r_j|, ranks among
-            all pairs; NaN if either is constant.
-        p_value: Share of permutations of the cameras (Mantel's test) with at least as large a
-            correlation.
+        rates: [4] share of conflicting pairs in each quarter of |log r_i - log r_j|, with camera
+            distances r; NaN for an empty quarter.
+        correlation: Rank correlation (Spearman) of conflict with |log r_i - log r_j| over all
+            pairs; NaN if one of them is constant.
+        p_value: Share of camera permutations (Mantel's test) that give a correlation at least as
+            large.
     """
 
     rates: NDArray[np.float64]
@@ -40,10 +41,10 @@ def conflict_by_distance(
     *,
     permutations: int = 499,
 ) -> DistanceConflict:
-    """Measure Observation 1 of the paper within one scene, for one block.
+    """Measure Observation 1 of the paper within one scene, for one parameter block.
 
-    Every pair of views with a dot product other than zero counts. Pairs share cameras, so their
-    correlation is tested by permuting cameras, not pairs.
+    Every pair of views whose gradients have a non-zero dot product counts. Different pairs contain
+    the same cameras, so the test permutes cameras and not pairs.
 
     Args:
         gramian: [V, V] dot products of the views' gradients.
@@ -62,14 +63,15 @@ def conflict_by_distance(
     apart = _apart(logs, first, second)
     negative = products[first, second] < 0.0
     edges = np.quantile(apart, np.linspace(0.0, 1.0, _BINS + 1))
-    # The first order is the original order of the data. The other orders are random permutations.
+    # The first order is the data's own order. The other orders are random permutations.
     orders = [
         np.arange(len(positive)),
         *(rng.permutation(len(positive)) for _ in range(permutations)),
     ]
     order = np.stack(orders)
     correlations = _correlations(ranks[order[:, first], order[:, second]], negative)
-    # Equal correlations may differ by rounding, because their sums have different orders.
+    # Equal correlations may differ by rounding errors, because their sums are computed in different
+    # orders.
     above = int((correlations[1:] >= correlations[0] - _ROUNDING).sum())
     p_value = (1 + above) / (1 + permutations) if np.isfinite(correlations[0]) else np.nan
     rates = _rates(apart, negative, edges)
@@ -77,14 +79,14 @@ def conflict_by_distance(
 
 
 def relative_variance(distances: NDArray[np.float64]) -> float:
-    """Return Var(r) / mean(r)^2 of distances [V]; NaN if all are 0, or if there are none."""
+    """Return Var(r) / mean(r)^2 of distances [V]; NaN without distances or if all are 0."""
     return float(distances.var() / distances.mean() ** 2) if distances.any() else float("nan")
 
 
 def _rates(
     apart: NDArray[np.float64], negative: NDArray[np.bool_], edges: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the share [Q] of negative pairs between edges [Q + 1]; NaN for an empty bin."""
+    """Return [Q] the share of negative pairs in each bin between edges [Q + 1]; NaN if empty."""
     bins = len(edges) - 1
     places = np.clip(np.searchsorted(edges, apart, side="right") - 1, 0, bins - 1)
     inside = [negative[places == bin_index] for bin_index in range(bins)]
@@ -92,7 +94,7 @@ def _rates(
 
 
 def _pair_ranks(logs: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rank [V, V] of |log r_i - log r_j| among all pairs."""
+    """Return [V, V] the rank of |log r_i - log r_j| among all pairs."""
     first, second = np.triu_indices(len(logs), 1)
     ranks = np.zeros((len(logs), len(logs)))
     ranks[first, second] = rankdata(_apart(logs, first, second))
@@ -102,12 +104,15 @@ def _pair_ranks(logs: NDArray[np.float64]) -> NDArray[np.float64]:
 def _apart(
     logs: NDArray[np.float64], first: NDArray[np.int64], second: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return |log r_i - log r_j| of pairs, rounded so that equal distances give equal values."""
+    """Return |log r_i - log r_j| of pairs.
+
+    The values are rounded so that equal distances give equal values.
+    """
     return np.asarray(np.abs(logs[first] - logs[second]).round(_DIGITS))
 
 
 def _correlations(ranks: NDArray[np.float64], negative: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the correlation [R] of each row of ranks [R, pairs] with conflict; NaN if constant."""
+    """Return [R] correlations of ranks [R, pairs] with conflict; NaN if ranks are constant."""
     about = ranks - ranks.mean(axis=1, keepdims=True)
     conflict = negative - negative.mean()
     lengths = np.sqrt((about**2).sum(axis=1) * (conflict @ conflict))

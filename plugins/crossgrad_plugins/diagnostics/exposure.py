@@ -1,4 +1,4 @@
-"""Differences in exposure between the photos of a scene, as rows and as text."""
+"""Differences in exposure between the photos of a scene, as table rows and as text."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,11 +21,12 @@ class SceneExposure:
 
     Attributes:
         rows: A row for each photo, in the order of the scene's views.
-        evidence: The evidence of `--exposure auto`: the gains of the training photos.
+        evidence: The values that `--exposure auto` compares; they belong to the gains of the
+            training photos.
         differ: True if the photos differ enough for a gain per photo.
         spread: Standard deviation of the gains, stops.
-        before: Deviation of the observations, stops.
-        after: Deviation of the observations after the gains are removed, stops.
+        before: Deviation of the observations before the gains are subtracted, stops.
+        after: Deviation of the observations after the gains are subtracted, stops.
     """
 
     rows: Sequence[Row]
@@ -61,8 +62,8 @@ def _rows(scene: Scene, gains: TrackGains) -> list[Row]:
     of_exif = exposure_values(scene)
     photo_gains = zip(scene.views, gains.gains, gains.known, strict=True)
     of_tracks = {view.name: float(gain) for view, gain, is_known in photo_gains if is_known}
-    # EXIF data give only differences of exposure. If some photos have both EXIF and track values,
-    # the EXIF values are shifted to match the track values.
+    # EXIF data determine exposure only up to a constant. If some photos have EXIF values and track
+    # values, the EXIF values are shifted by their mean difference.
     both = [of_tracks[name] - value for name, value in of_exif.items() if name in of_tracks]
     shift = median(both) if both else -sum(of_exif.values()) / max(1, len(of_exif))
     trained = frozenset(scene.train)

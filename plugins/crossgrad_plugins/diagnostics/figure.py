@@ -21,16 +21,16 @@ _METRICS = {"plain": ("o", "#0072B2"), "adam": ("s", "#D55E00")}
 #: Okabe and Ito's colours, distinguishable with any colour vision.
 _EXPOSURE_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _BLACK = "#000000"
-#: Maximum number of photos whose names fit below the axis.
+#: Maximum number of photos whose names are written below the axis.
 _MOST_NAMES = 60
 
 
 def draw(title: str, probes: Sequence[Row], cameras: Sequence[Row]) -> bytes:
-    """Draw the picture of the probes as PNG.
+    """Draw the figure of all probes as PNG.
 
     Args:
         title: Title of the picture.
-        probes: Rows of all probes; the last probe fills the panels without a time axis.
+        probes: Table rows of all probes; panels without a time axis show the last probe.
         cameras: Rows of `camera_rows`.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -83,7 +83,7 @@ def _trajectory(axes: "Axes", probes: Sequence[Row], column: str, label: str) ->
 
 
 def _intervals(axes: "Axes", rows: Sequence[Row], column: str, label: str) -> None:
-    """Draw a point with its interval for each block, side by side for the metrics."""
+    """Draw a point with its interval for each block; the two metrics are side by side."""
     blocks = _blocks(rows)
     for shift, (metric, (marker, color)) in zip((-0.12, 0.12), _METRICS.items(), strict=True):
         by_block = {str(row["block"]): row for row in rows_of(rows, metric)}
@@ -102,14 +102,14 @@ def _intervals(axes: "Axes", rows: Sequence[Row], column: str, label: str) -> No
 
 
 def _drawable(high: NDArray[np.float64], low: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Replace infinite upper ends by a value slightly above the largest finite end."""
+    """Replace infinite upper ends of intervals by a value slightly above the largest finite end."""
     finite = high[np.isfinite(high)]
     top = 1.2 * float(finite.max()) if len(finite) else float(np.nanmax(np.append(low, 1.0)))
     return np.where(np.isinf(high), top, high)
 
 
 def _by_distance(axes: "Axes", rows: Sequence[Row]) -> None:
-    """Draw the conflict of all pairs of views by their difference in distance, a line per block."""
+    """Draw one line per block: conflict of pairs of views by their difference in distance."""
     plain = rows_of(rows, "plain")
     singles = [row for row in plain if row["block"] not in {ALL, "+".join(AMPLITUDES)}]
     for number, row in enumerate(singles):
@@ -125,7 +125,7 @@ def _by_distance(axes: "Axes", rows: Sequence[Row]) -> None:
 
 
 def _bimodality(axes: "Axes", cameras: Sequence[Row]) -> None:
-    """Draw Sarle's coefficient in both forms."""
+    """Draw both forms of Sarle's bimodality coefficient."""
     names = [str(row["quantity"]).split(" (")[0] for row in cameras]
     places = np.arange(len(names))
     for shift, column, color in ((-0.2, "sample", _COLORS[0]), (0.2, "population", _COLORS[1])):
@@ -142,7 +142,7 @@ def _bimodality(axes: "Axes", cameras: Sequence[Row]) -> None:
 
 
 def draw_exposure(title: str, exposure: SceneExposure) -> bytes:
-    """Draw the picture of the exposure as PNG."""
+    """Draw the figure of the exposure as PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -158,7 +158,10 @@ def draw_exposure(title: str, exposure: SceneExposure) -> bytes:
 
 
 def _draw_gains(axes: "Axes", exposure: SceneExposure) -> None:
-    """Draw a bar for each photo, held-out photos hatched, and EXIF values as markers."""
+    """Draw a bar for each photo and a marker for each EXIF value.
+
+    Bars of held-out photos are hatched.
+    """
     rows = exposure.rows
     places = np.arange(len(rows))
     gains, exif = (np.array([float(r[k]) for r in rows]) for k in ("gain_stops", "exif_stops"))
@@ -183,7 +186,7 @@ def _draw_gains(axes: "Axes", exposure: SceneExposure) -> None:
 
 
 def _draw_rule(axes: "Axes", exposure: SceneExposure) -> None:
-    """Draw the values that the exposure rule compares, each with its threshold."""
+    """Draw the values that the exposure rule compares, and the threshold of each value."""
     values = (exposure.spread, exposure.before, exposure.after)
     limits = (LEAST_SPREAD, np.nan, (1.0 - LEAST_REDUCTION) * exposure.before)
     axes.bar(range(3), values, 0.6, color=(_EXPOSURE_COLORS[0], "0.6", _EXPOSURE_COLORS[2]))

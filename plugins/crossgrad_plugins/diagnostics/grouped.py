@@ -1,4 +1,4 @@
-"""Two groups of cameras: Gramian, variance within and between groups, ratio of gradients."""
+"""Two groups of cameras: Gramian, variance within and between groups, ratio of gradient lengths."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,14 +15,15 @@ SMALLEST_GROUP = 2
 
 @dataclass(frozen=True, eq=False)
 class Groups:
-    """The group of each view of a probe, and the population that the views represent.
+    """The group of each probed view, and the cameras from which the views were drawn.
 
     Attributes:
-        near: [V] bool, the views of the near group; all other views are far.
-        cameras: Sizes (near, far) of the population that the views were drawn from without
-            replacement; None if the views represent cameras in general (independent draws).
+        near: [V] bool, True for views of the near group; all other views are far.
+        cameras: Number of (near, far) cameras from which the views were drawn without replacement;
+            None for independent draws from an unlimited set.
         shares: Weights (near, far) of the groups, summing to 1. Equal weights describe the
-            objective of a balanced pair; weights by size describe the mean over cameras.
+            objective of a balanced pair. Weights proportional to the group sizes describe the mean
+            over all cameras.
     """
 
     near: NDArray[np.bool_]
@@ -40,13 +41,16 @@ class Groups:
 
     @cached_property
     def sizes(self) -> tuple[int, int]:
-        """Number of (near, far) views in the probe."""
+        """Number of probed views in (near, far)."""
         near = int(np.count_nonzero(self.near))
         return near, len(self.near) - near
 
     @cached_property
     def unseen(self) -> tuple[float, float]:
-        """1 - n/N of each group, the share of its cameras not probed; 1 if N is unknown."""
+        """1 - n/N of each group: the share of its N cameras that were not probed.
+
+        1 if N is unknown.
+        """
         if self.cameras is None:
             return 1.0, 1.0
         near, far = (
@@ -56,9 +60,9 @@ class Groups:
 
     @cached_property
     def divisors(self) -> tuple[float, float]:
-        """(N-1)/N of each group: the factor from sample variance to population variance.
+        """(N-1)/N of each group: the factor from sample variance to the variance of its N cameras.
 
-        It is 1 if N is unknown.
+        The factor is 1 if N is unknown.
         """
         if self.cameras is None:
             return 1.0, 1.0
@@ -68,19 +72,19 @@ class Groups:
 
 @dataclass(frozen=True, eq=False)
 class GroupedGramian:
-    """The Gramian of one block, near views first, split into means and deviations.
+    """The Gramian of a block, split into group means and deviations, near views first.
 
-    All values are relative to `scale`, the mean squared norm, so that no value can overflow.
+    All values are divided by `scale`, so that no value can overflow.
 
     Attributes:
-        scale: Mean of the Gramian's diagonal.
-        near: [n, n] dot products of deviations from the near mean.
-        far: [m, m] dot products of deviations from the far mean.
-        cross: [n, m] dot products of near with far deviations.
+        scale: Mean squared length of the gradients: the mean of the Gramian's diagonal.
+        near: [n, n] dot products of the near views' deviations from the near mean.
+        far: [m, m] dot products of the far views' deviations from the far mean.
+        cross: [n, m] dot products of near deviations with far deviations.
         gap: Squared distance of the two sample means.
-        near_along: [n] dot products of near deviations with (near mean - far mean), each without
-            the view's own contribution to its group's mean; centred.
-        far_along: [m] the same dot products for the far group.
+        near_along: [n] dot products of near deviations with (near mean - far mean), centred; the
+            view itself is left out of its group's mean.
+        far_along: [m] dot products of far deviations with (near mean - far mean), in the same form.
     """
 
     scale: float
@@ -103,8 +107,8 @@ class GroupedGramian:
         centring = np.eye(n + m) - averaging
         deviations = centring @ ordered @ centring
         difference = np.concatenate([np.full(n, 1.0 / n), np.full(m, -1.0 / m)])
-        # Leave the view out of the mean. If it were included, the length of its gradient would
-        # correlate with its position along the gap.
+        # Leave the view out of the mean of its group. If the view were included, the length of its
+        # gradient would correlate with its position along the difference of the means.
         self_terms = np.diag(deviations) / np.concatenate(
             [np.full(n, n - 1.0), np.full(m, 1.0 - m)]
         )
@@ -125,9 +129,10 @@ class GradientRatio:
     """Ratio of gradient lengths, near over far; NaN if the far gradients are zero.
 
     Attributes:
-        of_means: Mean length over near views / mean length over far views (the paper's R).
-        median: Median ratio of lengths over pairs of one near and one far view; pairs with a zero
-            gradient are left out.
+        of_means: Mean length over near views, divided by the mean length over far views (the
+            paper's R).
+        median: Median ratio of lengths over pairs of a near and a far view, without pairs that
+            contain a zero gradient.
     """
 
     of_means: float
@@ -138,9 +143,9 @@ def gradient_ratio(squared: NDArray[np.float64], near: NDArray[np.bool_]) -> Gra
     """Return the ratio of gradient lengths for one block.
 
     Args:
-        squared: [V] squared gradient lengths: the diagonal of the block's Gramian, or the sum of
-            the diagonals of several blocks for their concatenation.
-        near: [V], the views of the near group; all other views are far.
+        squared: [V] squared gradient lengths. They are the diagonal of the block's Gramian, or the
+            sum of several diagonals for several concatenated blocks.
+        near: [V] bool, True for views of the near group; all other views are far.
     """
     lengths = np.sqrt(np.maximum(squared, 0.0))
     far_mean = float(lengths[~near].mean())
@@ -153,7 +158,7 @@ def gradient_ratio(squared: NDArray[np.float64], near: NDArray[np.bool_]) -> Gra
 
 
 def geometric_mean(ratios: tuple[float, ...]) -> float:
-    """Return the geometric mean of ratios of blocks with different units; NaN if one is not > 0."""
+    """Return the geometric mean of ratios of blocks; NaN if a ratio is not positive."""
     if not all(ratio > 0.0 for ratio in ratios):
         return float("nan")
     return float(np.exp(np.mean(np.log(ratios))))
@@ -161,11 +166,13 @@ def geometric_mean(ratios: tuple[float, ...]) -> float:
 
 @dataclass(frozen=True)
 class VarianceSplit:
-    """Unbiased estimates of the paper's variances; `between` may be negative.
+    """Unbiased estimates of the paper's two variances.
+
+    The estimate `between` may be negative.
 
     Attributes:
-        within: sigma_w^2, weighted mean over groups of E||g - group mean||^2.
-        between: sigma_b^2, product of the shares times ||near mean - far mean||^2.
+        within: sigma_w^2, the weighted mean over groups of E||g - group mean||^2, with gradient g.
+        between: sigma_b^2, the product of the two group weights times ||near mean - far mean||^2.
     """
 
     within: float
@@ -173,19 +180,19 @@ class VarianceSplit:
 
     @property
     def ratio(self) -> float:
-        """sigma_b^2 / sigma_w^2; NaN without variance within groups."""
+        """sigma_b^2 / sigma_w^2; NaN if there is no variance within groups."""
         return self.between / self.within if self.within > 0.0 else float("nan")
 
 
 def variance_split(gramian: NDArray[np.float64], groups: Groups) -> VarianceSplit:
     """Estimate sigma_w^2 and sigma_b^2 from the Gramian [V, V] of one block.
 
-    The plain ||difference of means||^2 overestimates sigma_b^2 by the noise of the means, so this
-    noise is subtracted. With one view per group, only noise would remain. Both values are linear in
-    the Gramian: for a sum over probes of the same views, the values are added.
+    The plain squared distance of the means is too large by the noise of the means, so this noise is
+    subtracted. With one view per group, the noise could not be estimated. Both values are linear in
+    the Gramian, so the values of several probes of the same views can be added.
 
-    Source: the paper, Proposition 2; unbiased estimators of the variance of a mean, with the finite
-    population's correction if the views were drawn without replacement.
+    Source: the paper, Proposition 2; unbiased estimators of the variance of a mean. If the views
+    were drawn without replacement, the correction for a finite population is applied.
     """
     parts = GroupedGramian.of(gramian, groups)
     within, between = split_of(parts, groups)

@@ -1,4 +1,4 @@
-"""Confidence intervals of the variance split by a studentised bootstrap over cameras."""
+"""Confidence intervals of the variance split, by a studentised bootstrap over cameras."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,18 +10,18 @@ from numpy.typing import NDArray
 from crossgrad_plugins.diagnostics.grouped import GroupedGramian, Groups, split_of
 from crossgrad_plugins.diagnostics.resampling import Resamples
 
-#: First value: maximum share of the error of the ratio's interval that moves from the lower to the
-#: upper end. Second value: if sigma_w^2 contributes at least this share of the variance, the
-#: maximum applies. A sample with too few long gradients makes sigma_w^2 too small and the ratio too
-#: large.
+#: The first value is the maximum share of the error probability that moves from the lower to the
+#: upper end of the ratio's interval. The second value is the share of sigma_w^2 in the variance
+#: from which on this maximum applies. The error is moved because a sample with too few long
+#: gradients gives a too small sigma_w^2 and a too large ratio.
 _MOVED = 0.4
 _WITHIN_RULES = 1.0 / 3.0
-#: The unbiased estimate of tr(Sigma^2) needs four views of each group.
+#: The unbiased estimate of tr(Sigma^2), with covariance Sigma, needs four views of each group.
 SMALLEST_FOR_INTERVALS = 4
-#: A variance below this size, relative to the squared lengths, counts as a rounding error.
+#: A variance below this share of the squared lengths counts as a rounding error.
 _NEGLIGIBLE = 1e-13
-#: Share of the error of sigma_w^2's interval that is put on its upper end. The error is not split
-#: evenly, because a small sample of views more often contains too few of the rare long gradients
+#: Share of the error probability of sigma_w^2's interval that is assigned to its upper end. The
+#: split is uneven because a small sample contains too few of the rare long gradients more often
 #: than too many.
 _UPPER_SHARE = 0.2
 _DOUBLINGS = 60
@@ -30,9 +30,9 @@ _BISECTIONS = 24
 
 @dataclass(frozen=True)
 class Interval:
-    """A confidence interval; the upper end is infinite if there is no upper bound.
+    """A confidence interval; the upper end is infinite if there is no bound.
 
-    Both ends are NaN if the interval is unknown, or if every possible value is rejected.
+    Both ends are NaN if the interval is unknown or if every possible value is rejected.
     """
 
     low: float
@@ -43,18 +43,19 @@ class Interval:
         return self.low <= value <= self.high
 
     def times(self, factor: float) -> "Interval":
-        """Return the interval of the quantity times a factor >= 0."""
+        """Return the interval of the quantity times a non-negative factor."""
         return Interval(self.low * factor, self.high * factor)
 
 
 @dataclass(frozen=True, eq=False)
 class Pivot:
-    """The studentised estimate under the assumption of a true value.
+    """The studentised estimate and its resamples, for an assumed true value.
 
     Attributes:
-        observed: The estimate of the sample.
-        resampled: [R] estimates of the resamples.
-        lower_share: Share of the interval's error that is assigned to its lower end.
+        observed: The studentised estimate of the sample.
+        resampled: [R] studentised estimates of the resamples.
+        lower_share: Share of the error probability that is assigned to the lower end of the
+            interval.
     """
 
     observed: float
@@ -62,7 +63,7 @@ class Pivot:
     lower_share: float = 0.5
 
     def above(self, level: float, *, lower_end: bool) -> bool:
-        """Return True if only a larger true value makes the estimate credible."""
+        """Return True if the sample is unlikely unless the true value is larger than assumed."""
         error = 1.0 - level
         tail = 1.0 - error * self.lower_share if lower_end else error * (1.0 - self.lower_share)
         return self.observed > float(np.quantile(self.resampled, tail))
@@ -73,11 +74,11 @@ class StudentisedGap:
     """The resamples of one block and the variance of its noise.
 
     Attributes:
-        draws: The resamples, with the sample itself in row 0; shifts are scaled to their size along
-            the true gap.
-        estimate: Unbiased estimate of the gap theta = ||near mean - far mean||^2.
+        draws: The resamples, with the sample itself in row 0; their shifts are scaled to the
+            variance along the true gap.
+        estimate: Unbiased estimate of the squared gap theta = ||near mean - far mean||^2.
         plain_gap: Squared distance of the sample means.
-        floor: Variance of the estimate at theta = 0.
+        floor: Variance of the estimate if theta is 0.
         floors: [R] `floor` of each resample.
     """
 
@@ -91,7 +92,7 @@ class StudentisedGap:
     def of(cls, parts: GroupedGramian, groups: Groups, draws: Resamples) -> "StudentisedGap":
         """Combine the split Gramian with its resamples."""
         noise = draws.noise[1:]
-        # The noise of a resample is proportional to the square of its spread.
+        # The noise of a resample is scaled by the square of its spread.
         relative = (draws.spread[1:] / draws.spread[0]) ** 2
         floors = relative * (float(noise.var()) / float(relative.mean()))
         floor = _variance_without_gap(parts, groups)
@@ -104,7 +105,7 @@ class StudentisedGap:
         )
 
     def within(self, tails: tuple[float, float]) -> Interval:
-        """Return the interval of sigma_w^2, by bootstrap-t of its logarithm."""
+        """Return the interval of sigma_w^2, from a bootstrap-t of its logarithm."""
         values = self.draws.within
         errors = np.sqrt(self.draws.within_variance) / values
         if errors[0] == 0.0:
@@ -117,7 +118,7 @@ class StudentisedGap:
         )
 
     def gap_pivot(self, gap: float) -> Pivot:
-        """Return the studentised estimate and its resamples, if `gap` is the true gap."""
+        """Return the studentised estimate and its resamples if `gap` is the true squared gap."""
         draws, root = self.draws, sqrt(gap)
         variance = 4.0 * gap * draws.shift_variance
         numerators = 2.0 * root * draws.shift[1:] + (draws.noise[1:] - draws.noise[0])
@@ -125,9 +126,9 @@ class StudentisedGap:
         return Pivot(observed, numerators / np.sqrt(_positive(variance[1:] + self.floors)))
 
     def ratio_pivot(self, ratio: float) -> Pivot:
-        """Return the studentised gap - ratio * sigma_w^2 and its resamples.
+        """Return the studentised value of gap - ratio * sigma_w^2 and its resamples.
 
-        `ratio` is assumed to be the true ratio.
+        The calculation assumes that `ratio` is the true ratio.
         """
         draws = self.draws
         gap = ratio * float(draws.within[0])
@@ -151,21 +152,22 @@ class StudentisedGap:
 
     @property
     def start(self) -> float:
-        """Positive start of the search for the upper end of an interval."""
+        """Positive start value for the search of an interval's upper end."""
         return max(self.estimate, self.plain_gap, sqrt(self.floor))
 
 
 def _along_the_true_gap(draws: Resamples, gap: float, floor: float) -> float:
-    """Return the ratio of two variances of the shift: along the true gap over along the sample gap.
+    """Return the variance of the shift along the true gap, divided by the one along the sample gap.
 
-    The sample gap d is the true gap plus noise, and the noise is largest in the directions in which
-    gradients vary most. With the covariance Sigma of the difference of the means, noise adds
-    tr(Sigma^2), half of the `floor`, to d' Sigma d, and tr(Sigma) to |d|^2. Half of each term is
-    subtracted, or less if the whole gap could be noise, because the remainder is itself uncertain
-    with a dozen views.
+    The sample gap d is the true gap plus noise. The noise is largest in the directions in which
+    gradients vary most. Let Sigma be the covariance of the difference of the means. Noise adds
+    tr(Sigma^2), which is half of the `floor`, to d' Sigma d, and adds tr(Sigma) to |d|^2. Only half
+    of each term is subtracted, because the terms are uncertain with a dozen views. A smaller part
+    is subtracted if the whole gap could be noise.
 
-    If few directions dominate, 95 % intervals of sigma_b^2 contain the true value in up to 99.5 %
-    of the cases without the subtraction, and in 84 to 97 % if the full noise is subtracted.
+    Without the subtraction, 95 % intervals of sigma_b^2 contain the true value in up to 99.5 % of
+    the cases if few directions dominate. With the full subtraction, they contain it in 84 to 97 %
+    of the cases.
     """
     noise, along = float(draws.spread[0]), float(draws.shift_variance[0]) * gap
     if noise <= 0.0 or along <= 0.0:
@@ -175,7 +177,7 @@ def _along_the_true_gap(draws: Resamples, gap: float, floor: float) -> float:
 
 
 def _variance_without_gap(parts: GroupedGramian, groups: Groups) -> float:
-    """Return the variance of the estimated gap if the true gap is zero, in squared scale units."""
+    """Return the variance of the estimated gap for a true gap of zero, in squared scale units."""
     (n, m), (f, g) = groups.sizes, groups.unseen
     near = max(_squared_covariance(parts.near), 0.0)
     far = max(_squared_covariance(parts.far), 0.0)
@@ -185,7 +187,7 @@ def _variance_without_gap(parts: GroupedGramian, groups: Groups) -> float:
 
 
 def _squared_covariance(deviations: NDArray[np.float64]) -> float:
-    """Estimate tr(Sigma^2) without bias from dot products of deviations [n, n], any distribution.
+    """Estimate tr(Sigma^2) without bias from dot products of deviations [n, n].
 
     Source: Himeno and Yamada 2014.
     """
@@ -225,23 +227,25 @@ def split_intervals(
 ) -> SplitIntervals:
     """Estimate confidence intervals from the Gramian [V, V] of one block.
 
-    Cameras are resampled within their groups. Pairs of a camera with its own copy are left out,
-    because they would add the camera's squared norm to dot products between cameras. sigma_w^2 is
+    The bootstrap draws cameras with replacement within their groups. Pairs of a camera with its own
+    copy are left out, because their dot product is a squared norm. The interval of sigma_w^2 is
     studentised on the logarithmic scale.
 
-    sigma_b^2 is quadratic in the distance theta of the group means, so its noise depends on theta.
-    The interval holds every theta that the estimate does not reject with the standard error of
-    *that* theta; the bootstrap is moved to theta for the critical values. The interval of the ratio
-    is computed in the same way from theta - ratio sigma_w^2. The larger the part of sigma_w^2 in
-    this noise, the larger the share of the error that is assigned to the upper end. The ends are
-    never negative, although the estimate may be.
+    sigma_b^2 is quadratic in the distance of the group means, so its noise depends on the squared
+    distance theta. The interval contains every theta that the estimate does not reject. Each test
+    uses the standard error for its own theta, and critical values from a bootstrap that is moved to
+    this theta. The interval of the ratio sigma_b^2 / sigma_w^2 is computed in the same way from
+    theta - ratio sigma_w^2. The larger the part of sigma_w^2 in the noise of this difference, the
+    larger the share of the error probability at the upper end. The ends are never negative,
+    although an estimate may be negative.
 
     All intervals are unknown (NaN) with fewer than four views in a group, or without variance. The
-    intervals of sigma_b^2 and of the ratio are also unknown if the estimate is so far below 0 that
-    even 0 is rejected.
+    intervals of sigma_b^2 and of the ratio are also unknown if the estimate is far below 0, because
+    then even the value 0 is rejected.
 
-    Source: bootstrap-t and intervals by test inversion, Efron and Tibshirani 1993; variance of the
-    statistic, Chen and Qin 2010. Coverage: `benchmarks/interval_coverage.py`.
+    Source: Efron and Tibshirani 1993 for bootstrap-t and intervals by test inversion; Chen and Qin
+    2010 for the variance of the statistic. `benchmarks/interval_coverage.py` measures how often the
+    intervals contain the true value.
     """
     parts = GroupedGramian.of(gramian, groups)
     within, between = split_of(parts, groups)
@@ -261,7 +265,10 @@ def split_intervals(
 
 
 def _points(within: float, between: float) -> SplitIntervals:
-    """Return intervals of zero width: the values are exact, because every camera was probed."""
+    """Return intervals of zero width.
+
+    If every camera was probed, the values are exact.
+    """
     figures = (within, between, between / within)
     return SplitIntervals(*(Interval(figure, figure) for figure in figures))
 
@@ -276,15 +283,16 @@ UNKNOWN = Interval(float("nan"), float("nan"))
 
 
 def inverted(pivot: Callable[[float], Pivot], start: float, level: float) -> Interval:
-    """Return the interval of the values >= 0 that are not rejected; unknown (NaN) if all are.
+    """Return the interval of the values >= 0 that are not rejected; NaN if all are rejected.
 
     Args:
-        pivot: Value -> studentised estimate if that value is the true value.
-        start: Positive value of about the size of the upper end.
+        pivot: Function of a value; returns the studentised estimate if this value is the true
+            value.
+        start: Positive value near the expected upper end.
         level: Confidence level of the interval.
     """
-    # If the value 0 is rejected as too large, all larger values are rejected too. The interval [0,
-    # 0] would then wrongly claim exactly 0.
+    # If the value 0 is rejected as too large, all larger values are also rejected. The interval [0,
+    # 0] would then wrongly state that the value is exactly 0.
     if not pivot(0.0).above(level, lower_end=False):
         return UNKNOWN
     return Interval(
@@ -294,7 +302,7 @@ def inverted(pivot: Callable[[float], Pivot], start: float, level: float) -> Int
 
 
 def _crossing(above: Callable[[float], bool], start: float) -> float:
-    """Return the value at which `above` becomes false on [0, inf); infinite if it never does."""
+    """Return the value in [0, inf) at which `above` becomes false; infinite if it never does."""
     if not above(0.0):
         return 0.0
     low, high = 0.0, start

@@ -1,4 +1,4 @@
-"""Probes during a run: conflict, gradient ratios, variance within and between groups."""
+"""Gradient measurements during a run: conflict, ratios, variance within and between groups."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,17 +10,17 @@ from crossgrad_core.plugin import Model, Observer, RunInfo, hookimpl
 if TYPE_CHECKING:
     from crossgrad_plugins.diagnostics.watch import Watch
 
-#: Number of gradient measurements in a run if the user sets no interval.
+#: Number of gradient measurements in a run if the user does not set an interval.
 _PROBES = 8
 
 
 class Diagnostics(Observer):
-    """An observer that measures the gradients of chosen views at an interval, at frozen parameters.
+    """An observer that measures the gradients of chosen views at an interval.
 
     The observer writes diagnostics.csv, cameras.csv, groupings.csv and diagnostics.png to the run's
-    folder. The views are drawn by the observer's own generator, so the result of training does not
-    change. A probe costs a forward and a backward pass of each probed view. This time does not
-    count as training time; the column `probe_seconds` contains it.
+    folder. The observer draws views with its own generator, so it does not change the result of
+    training. A measurement costs a forward and a backward pass of each chosen view. Its time does
+    not count as training time, and is stored in the column `probe_seconds`.
     """
 
     every: int | None = Field(
@@ -35,18 +35,18 @@ class Diagnostics(Observer):
     )
     seed: int = Field(0, ge=0, description="seed for the choice of views and for the bootstrap")
 
-    # The results so far. They are not part of the run's state.
+    # The results so far. These values are not stored in checkpoints.
     _run: RunInfo | None = PrivateAttr(default=None)
     _watch: "Watch | None" = PrivateAttr(default=None)
 
     @hookimpl
     def crossgrad_run_start(self, run: RunInfo) -> None:
-        """Store the run and its output folder."""
+        """Keep the run and its output folder for later calls."""
         self._run, self._watch = run, None
 
     @hookimpl
     def crossgrad_model_ready(self, model: Model) -> None:
-        """Probe the model when a probe is due, and write the table."""
+        """Measure the gradients if a measurement is due, and write the table."""
         if self._watch is None:
             self._watch = self._start(model)
         watch = self._watch
@@ -61,7 +61,7 @@ class Diagnostics(Observer):
 
     @hookimpl
     def crossgrad_run_end(self, status: str) -> None:
-        """Write the picture and the tables that do not change during the run."""
+        """Write the figure and the tables that do not change during the run."""
         folder, watch, run = self._folder(), self._watch, self._run
         if folder is None or watch is None or run is None or watch.last is None:
             return
@@ -71,7 +71,7 @@ class Diagnostics(Observer):
         return None if self._run is None else self._run.folder
 
     def _start(self, model: Model) -> "Watch":
-        """Choose the views to probe, and read the rows of a resumed run."""
+        """Choose the views to measure, and read the earlier rows of a resumed run."""
         from crossgrad_plugins.diagnostics.plan import (
             DEFAULT_GROUPING,
             OF_THE_RUN,

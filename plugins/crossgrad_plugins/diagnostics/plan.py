@@ -1,4 +1,4 @@
-"""The views of a probe: equally many near and far views, the same in every probe."""
+"""The views of a gradient measurement: equally many near and far views, always the same."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,21 +12,21 @@ from crossgrad_plugins.diagnostics.grouped import SMALLEST_GROUP
 
 #: The default grouping of a gradient measurement, as in the paper.
 DEFAULT_GROUPING = "radial"
-#: The name of the grouping that a run was trained with.
+#: The name that stands for the grouping that a run was trained with.
 OF_THE_RUN = "of the run"
 
 
 @dataclass(frozen=True, eq=False)
 class ProbePlan:
-    """The views of a probe.
+    """The views whose gradients are measured.
 
     Attributes:
-        grouping: Name of the grouping, or the origin of the labels.
+        grouping: Name of the grouping, or a text about the origin of the labels.
         near_label: Label of the near group.
         far_label: Label of the far group.
         labels: Label of every training view.
-        views: Positions in `scene.train_views`, in ascending order.
-        notes: Notes of the grouping.
+        views: Indices in `scene.train_views`, in ascending order.
+        notes: Notes that the grouping returned.
     """
 
     grouping: str
@@ -37,17 +37,17 @@ class ProbePlan:
     notes: tuple[str, ...] = ()
 
     def near(self, views: Sequence[int]) -> NDArray[np.bool_]:
-        """Return which of these views [V] are near."""
+        """Return [V] bool, True for near views."""
         return np.array([self.labels[view] == self.near_label for view in views])
 
     @property
     def cameras(self) -> tuple[int, int]:
-        """Numbers of (near, far) training views."""
+        """Number of (near, far) training views."""
         return self.labels.count(self.near_label), self.labels.count(self.far_label)
 
 
 def require_views(scene: Scene) -> None:
-    """Refuse a scene that is too small for two groups.
+    """Refuse a scene that has too few views for two groups.
 
     Raises:
         UserError: The scene has too few training photos.
@@ -66,10 +66,10 @@ def require_views(scene: Scene) -> None:
 def labelled(
     scene: Scene, grouping: str, seed: int, options: Mapping[str, Json] | None = None
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Label the training views with a grouping and its options; return labels and notes.
+    """Label the training views by a grouping with its options; return labels and notes.
 
     Raises:
-        UserError: The grouping does not exist, or it cannot group this scene.
+        UserError: The grouping does not exist, or it cannot divide this scene.
     """
     component = build(Grouping, grouping, options or {})
     rule = component.fit(scene, np.random.default_rng(seed))
@@ -79,18 +79,18 @@ def labelled(
 def plan_probe(
     scene: Scene, grouping: str, labels: tuple[str, ...], per_group: int, seed: int
 ) -> ProbePlan:
-    """Draw up to `per_group` views from the nearest and from the farthest group.
+    """Draw up to `per_group` views from the nearest group and from the farthest group.
 
     Args:
         scene: The scene.
         grouping: Name of the grouping.
-        labels: The grouping's label of every training view; of three or more groups, only the
-            nearest and the farthest are probed.
-        per_group: Views per group.
-        seed: Seed of the probe's own generator.
+        labels: Label of every training view. If there are three or more groups, only the nearest
+            and the farthest are used.
+        per_group: Maximum number of views per group.
+        seed: Seed of the generator that draws the views.
 
     Raises:
-        UserError: There is only one group, or a group has a single view.
+        UserError: There is only one group, or a group has only one view.
     """
     near_label, far_label = _outermost(scene, labels)
     rng = np.random.default_rng(seed)
@@ -132,7 +132,7 @@ def _outermost(scene: Scene, labels: tuple[str, ...]) -> tuple[str, str]:
 
 
 def _closeness(scene: Scene) -> NDArray[np.float64]:
-    """Return a number [N] per training view that is larger for nearer views."""
+    """Return [N] a number per training view that is larger for nearer views."""
     footprints = np.array([footprint_of(scene, view) for view in scene.train_views])
     if np.isnan(footprints).any():
         return -radial_distances(scene, scene.train_views)

@@ -1,4 +1,4 @@
-"""Gradients of chosen views at frozen parameters, as Gramians in two metrics."""
+"""Gradients of chosen views at fixed parameters, as Gramians in two metrics."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,20 +20,19 @@ _Gradients = dict[str, Tensor]
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """The Gramians of V views at one step.
+    """The Gramians of V views at a step.
 
     Attributes:
-        step: The last complete step.
-        views: [V] positions in `scene.train_views`; views with a non-finite gradient are left
-            out.
-        blocks: [B] names of the blocks, without frozen blocks.
+        step: The last completed step.
+        views: [V] indices in `scene.train_views`; views with a non-finite gradient are left out.
+        blocks: [B] names of the parameter blocks, without frozen blocks.
         kinds: [B] kinds of the blocks.
         plain: [B, V, V] dot products of gradients.
-        adam: [B, V, V] dot products of gradients over the root of Adam's second moment; None before
-            the first step.
-        overlap: [B, V, V] True if the gradients of two views share a non-zero element.
-        dropped: Names of the views that were left out.
-        share: Share of the primitives whose gradients were measured.
+        adam: [B, V, V] dot products of gradients divided by the root of Adam's second moment; None
+            before the first step.
+        overlap: [B, V, V] True if there is an element in which both gradients are non-zero.
+        dropped: Names of the views with a non-finite gradient.
+        share: Share of the primitives that were measured.
     """
 
     step: int
@@ -50,14 +49,15 @@ class Measurement:
 def measure(model: Model, views: Sequence[int], rng: np.random.Generator) -> Measurement:
     """Measure the Gramians of the gradients of the given training views.
 
-    Each view's own photometric loss is differentiated; the model is not changed. If the gradients
-    of all views do not fit into `MEMORY`, a uniform random subset of the primitives is measured.
-    The dot products of the per-primitive blocks are then unbiased estimates.
+    The loss of each view is differentiated separately; the model is not changed. If the gradients
+    of all views do not fit into `MEMORY` bytes, only a uniform random subset of the primitives is
+    measured. For per-primitive blocks, the scaled dot products of the subset are unbiased
+    estimates.
 
     Args:
         model: The model.
-        views: Positions in `scene.train_views`.
-        rng: Chooses the subset.
+        views: Indices in `scene.train_views`.
+        rng: Generator that chooses the subset.
     """
     blocks = model.backbone.trained_blocks()
     rows, share = _rows(model, len(views), rng)
@@ -90,7 +90,7 @@ def measure(model: Model, views: Sequence[int], rng: np.random.Generator) -> Mea
 
 @dataclass(frozen=True, eq=False)
 class ModelProbe:
-    """The gradients of a model, in the form that groupings require (`GradientProbe`)."""
+    """The gradients of a model in the form that groupings need (`GradientProbe`)."""
 
     model: Model
     rng: np.random.Generator
@@ -101,7 +101,7 @@ class ModelProbe:
         return tuple(block.name for block in self.model.backbone.trained_blocks())
 
     def gramians(self, views: Sequence[int]) -> NDArray[np.float64]:
-        """Return Gramians [B, V, V]; a view with a non-finite gradient counts as zero."""
+        """Return [B, V, V] Gramians; a non-finite gradient counts as zero."""
         measurement = measure(self.model, views, self.rng)
         places = [list(views).index(view) for view in measurement.views]
         full = np.zeros((len(self.blocks), len(views), len(views)))
@@ -111,12 +111,12 @@ class ModelProbe:
 
 @dataclass(frozen=True, eq=False)
 class _Subset:
-    """The rows of per-primitive tensors that are measured.
+    """The measured rows of per-primitive tensors.
 
     Attributes:
-        rows: Row numbers; None for all rows.
+        rows: Indices of the rows; None for all rows.
         tensors: Names of the per-primitive tensors.
-        share: Share of the rows that is measured.
+        share: Share of the rows that are measured.
     """
 
     rows: Tensor | None
@@ -124,7 +124,7 @@ class _Subset:
     share: float
 
     def of(self, gradients: Mapping[str, Tensor]) -> _Gradients:
-        """Return the gradients of the subset, scaled to keep the expectation of dot products."""
+        """Return the gradients of the subset, scaled so that expected dot products stay equal."""
         if self.rows is None:
             return dict(gradients)
         length = 1.0 / sqrt(self.share)
@@ -139,7 +139,7 @@ class _Subset:
 
 
 def _rows(model: Model, views: int, rng: np.random.Generator) -> tuple[Tensor | None, float]:
-    """Choose the rows to measure; return them with their share of all rows."""
+    """Choose the rows to measure; return the rows and their share of all rows."""
     per_primitive = [
         t for b in model.backbone.trained_blocks() if b.per_primitive for t in b.tensors
     ]
@@ -156,11 +156,12 @@ def _rows(model: Model, views: int, rng: np.random.Generator) -> tuple[Tensor | 
 
 
 def _divide_by_adam(model: Model, subset: _Subset, gradients: Sequence[_Gradients]) -> None:
-    """Divide all gradients by the root of Adam's second moment after the next step.
+    """Divide all gradients by the root of Adam's second moment in the next step.
 
-    The next step would add the squared gradients to the moment before the division. This function
-    adds the mean of the squared gradients over the probed views instead, so that all views have the
-    same metric. This addition also bounds elements that training has never changed.
+    In training, the next step would first add the view's squared gradients to the moment. Here, the
+    mean of the squared gradients over all measured views is added instead, so that all views have
+    the same metric. The addition also limits elements that training has never changed, because
+    their moment is zero.
     """
     beta2 = model.rule.betas[1]
     for name, moment in model.adam.exp_avg_sq.items():

@@ -1,4 +1,4 @@
-"""The results of diagnostics: CSV files, a picture, and a few lines for the terminal."""
+"""The results of a diagnosis: CSV files, a figure, and some lines for the terminal."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,13 +31,13 @@ class Report:
 
     Attributes:
         scene: Name of the scene.
-        title: Scene and model.
-        probes: Rows of `table`, of all probes in sequence.
-        cameras: Rows of `camera_rows`.
-        groupings: Rows of `grouping_rows`, for the last probe.
-        notes: Notes for the reader.
-        failure: The reason if training failed; None otherwise.
-        exposure: The exposure of the photos; None if it was not measured.
+        title: Title of the report, with scene and model.
+        probes: Rows of all probes, as returned by `table`, one after the other.
+        cameras: Rows as returned by `camera_rows`.
+        groupings: Rows as returned by `grouping_rows`, for the last probe.
+        notes: Notes for the reader of the report.
+        failure: The reason why training failed, or None.
+        exposure: The exposure of the photos, or None if it was not measured.
     """
 
     scene: str
@@ -50,7 +50,7 @@ class Report:
     exposure: SceneExposure | None = None
 
     def write(self, folder: Path) -> None:
-        """Write the CSV files and the pictures.
+        """Write the CSV files and the figures.
 
         Raises:
             UserError: The disk is full, or the folder is read-only.
@@ -136,7 +136,7 @@ def _camera_lines(rows: Sequence[Row]) -> list[str]:
 def _grouping_lines(rows: Sequence[Row]) -> list[str]:
     """Return the first block's statistics for each grouping.
 
-    They depend on which views are near and which are far.
+    These statistics depend on which views are near and which are far.
     """
     lines = ["the same probe by grouping, plain metric"]
     for name in dict.fromkeys(str(row["grouping"]) for row in rows):
@@ -154,17 +154,17 @@ def _grouping_lines(rows: Sequence[Row]) -> list[str]:
 
 
 def _figure(value: float, form: str) -> str:
-    # Adding zero after rounding turns -0.00 into 0.00.
+    # Adding zero after rounding changes -0.00 to 0.00.
     return "-" if isnan(value) else format(float(format(value, form)) + 0.0, form)
 
 
 def read_probes(path: Path) -> list[Row]:
-    """Read rows of probes from a file of `write_table`; empty cells are NaN.
+    """Read the rows of probes from a file that `write_table` wrote; empty cells become NaN.
 
-    Without a file, there are no rows.
+    If the file does not exist, there are no rows.
 
     Raises:
-        UserError: The file cannot be read, or a row lacks cells or a step.
+        UserError: The file cannot be read, or a row lacks cells or a step number.
     """
     if not path.is_file():
         return []

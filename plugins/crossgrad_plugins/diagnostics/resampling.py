@@ -1,4 +1,4 @@
-"""Resampled values of a grouped Gramian: cameras are redrawn and never paired with copies."""
+"""Resamples of a grouped Gramian: cameras are redrawn, and never paired with their own copies."""
 
 from dataclasses import dataclass, replace
 from typing import Self
@@ -8,15 +8,18 @@ from numpy.typing import NDArray
 
 from crossgrad_plugins.diagnostics.grouped import GroupedGramian, Groups
 
-#: Minimum number of different cameras of a group in a resample. A resample with fewer cameras has
-#: no variance, so a new resample is drawn.
+#: Minimum number of different cameras of a group in a resample. With fewer cameras, a resample has
+#: no variance and is drawn again.
 _FEWEST_CAMERAS = 3
 
 _Array = NDArray[np.float64]
 
 
 def multiplicities(size: int, resamples: int, rng: np.random.Generator) -> _Array:
-    """Draw how often each camera occurs, [R + 1, size]; the first row is the sample itself."""
+    """Draw how often each camera occurs, [R + 1, size].
+
+    Row 0 is the sample itself.
+    """
     share = np.full(size, 1.0 / size)
     drawn = rng.multinomial(size, share, size=resamples)
     fewest = min(_FEWEST_CAMERAS, size)
@@ -27,12 +30,12 @@ def multiplicities(size: int, resamples: int, rng: np.random.Generator) -> _Arra
 
 @dataclass(frozen=True, eq=False)
 class GroupResamples:
-    """The contribution of one group, for each of R + 1 resamples.
+    """The values of one group in each of R + 1 resamples.
 
     Attributes:
-        counts: [R + 1, n] multiplicities.
-        spread: [R + 1] mean over pairs of different cameras of half their squared distance.
-        self_share: [R + 1] sum of squared multiplicities over n^2 (1/n in the sample itself).
+        counts: [R + 1, n] number of times that each camera occurs.
+        spread: [R + 1] half the squared distance of two different cameras, mean over pairs.
+        self_share: [R + 1] sum of squared counts over n^2; this is 1/n in the sample itself.
         along: [R + 1] mean deviation along (near mean - far mean).
         own: [R + 1] squared length of the mean deviation.
         linear: [R + 1] variance of the mean deviation along the gap.
@@ -57,8 +60,7 @@ class GroupResamples:
         halves = (squared[:, None] + squared[None, :] - 2.0 * deviations) / 2.0
         to_others = counts @ halves
         self_share = (counts * counts).sum(axis=1) / n**2
-        # Means of the pair kernel for each camera. Pairs of two copies of the same camera are left
-        # out.
+        # Mean of the pair values for each camera. Pairs of two copies of a camera are left out.
         conditional = 2.0 * to_others / (n - counts)
         mean_along = counts @ along / n
         about_along = along[None, :] - mean_along[:, None]
@@ -78,21 +80,21 @@ class GroupResamples:
 
 @dataclass(frozen=True, eq=False)
 class Resamples:
-    """All values that the intervals need; row 0 is the sample itself, in units of the scale.
+    """All resampled values that the intervals need.
 
-    If theta is the true ||near mean - far mean||^2, a resample's estimate of theta is theta + 2
-    sqrt(theta) `shift` + `noise`, minus the mean of the noise.
+    Row 0 is the sample itself, and values are in units of the scale. Let theta be the true ||near
+    mean - far mean||^2. The estimate of theta in a resample is theta + 2 sqrt(theta) `shift` +
+    `noise`, minus the mean of the noise.
 
     Attributes:
-        within: [R + 1] sigma_w^2.
+        within: [R + 1] estimate of sigma_w^2.
         within_variance: [R + 1] variance of `within`.
-        shift: [R + 1] mean deviation along the unit vector of the gap, without each view's own
-            contribution to the gap.
-        noise: [R + 1] squared mean deviation, minus the contribution of single cameras'
-            deviations.
+        shift: [R + 1] mean deviation along the direction of the gap; each view is left out of the
+            gap for its own deviation.
+        noise: [R + 1] squared mean deviation, minus the contribution of single cameras.
         shift_variance: [R + 1] variance of `shift`.
         covariance: [R + 1] covariance of `within` with `shift`.
-        spread: [R + 1] variance of the difference of the means, summed over dimensions.
+        spread: [R + 1] variance of the difference of the means, summed over all dimensions.
     """
 
     within: _Array
@@ -122,8 +124,8 @@ class Resamples:
         far = GroupResamples.of(parts.far, parts.far_along, multiplicities(m, resamples, rng))
         (f, g), (p, q) = groups.unseen, groups.shares
         p, q = p * groups.divisors[0], q * groups.divisors[1]
-        # The views of a group are finite in number, so the variance of the noise is multiplied by
-        # the share of views without a measurement.
+        # A group has a finite number of views. The variance of the noise is therefore multiplied by
+        # the share of views that were not measured.
         root_f, root_g = f**0.5, g**0.5
         near_spread = near.spread[0] + root_f * (near.spread - near.spread[0])
         far_spread = far.spread[0] + root_g * (far.spread - far.spread[0])

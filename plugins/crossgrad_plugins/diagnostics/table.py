@@ -22,18 +22,18 @@ from crossgrad_plugins.diagnostics.probe import Measurement
 
 @dataclass(frozen=True, eq=False)
 class Conflict:
-    """Conflict between near and far views, over all pairs of one near and one far view.
+    """Conflict between gradients, over all pairs of a near and a far view.
 
-    A pair counts for a block if both gradients are non-zero and overlap. Gradients without overlap
-    are orthogonal, but this does not mean that the views agree.
+    A pair counts for a block if both gradients are non-zero and overlap in at least one element.
+    Gradients that do not overlap are orthogonal, which does not mean that the views agree.
 
     Attributes:
-        per_block: [B] share of the counted pairs whose dot product is negative; NaN without pairs.
-        per_pair: Share of a pair's counted blocks that conflict, averaged over pairs; NaN without
-            pairs.
-        pairs: [B] counted pairs.
-        disjoint: [B] pairs of non-zero gradients that do not overlap.
-        zero: [B] pairs with a zero gradient.
+        per_block: [B] share of the counted pairs with a negative dot product; NaN without pairs.
+        per_pair: Share of conflicting blocks among the counted blocks of a pair, averaged over
+            pairs; NaN without pairs.
+        pairs: [B] number of counted pairs.
+        disjoint: [B] number of pairs whose gradients are non-zero and do not overlap.
+        zero: [B] number of pairs that contain a zero gradient.
     """
 
     per_block: NDArray[np.float64]
@@ -48,13 +48,13 @@ def conflict(
     near: NDArray[np.bool_],
     overlap: NDArray[np.bool_] | None = None,
 ) -> Conflict:
-    """Compute both definitions of the paper's "33-83 %" conflict rate.
+    """Compute the conflict rate in both definitions that the paper's "33-83 %" can have.
 
     Args:
         gramians: [B, V, V] dot products of gradients.
-        near: [V], the views of the near group; all other views are far.
-        overlap: [B, V, V], pairs whose gradients share a non-zero element; by default every pair
-            whose dot product is not exactly zero.
+        near: [V] bool, True for views of the near group; all other views are far.
+        overlap: [B, V, V] True for pairs whose gradients overlap. By default, every pair with a
+            non-zero dot product overlaps.
     """
     products = gramians[:, near][:, :, ~near]
     norms = np.einsum("bii->bi", gramians)
@@ -77,23 +77,23 @@ def _share(part: NDArray[np.int64], whole: NDArray[np.int64]) -> NDArray[np.floa
 
 
 def _mean(values: NDArray[np.float64]) -> float:
-    """Return the mean of the values that are not NaN; NaN if all values are NaN."""
+    """Return the mean without NaN values; NaN if all values are NaN."""
     valid = values[~np.isnan(values)]
     return float(valid.mean()) if len(valid) else float("nan")
 
 
-#: Minimum number of views for a fit of a line and for the scatter around the line.
+#: Minimum number of views for the fit of a line and for the scatter around it.
 _SMALLEST = 4
 
 
 @dataclass(frozen=True)
 class Exponent:
-    """d_theta of ||gradient|| ~ r^-d_theta; positive if near views have longer gradients.
+    """Exponent d in ||gradient|| ~ r^-d with distance r; positive if near gradients are longer.
 
     Attributes:
         value: The fitted exponent; NaN if it is undefined.
         interval: Confidence interval of the exponent.
-        views: Number of views with a non-zero gradient and distance.
+        views: Number of views whose gradient and distance are non-zero.
     """
 
     value: float
@@ -104,17 +104,18 @@ class Exponent:
 def distance_exponent(
     squared: NDArray[np.float64], distances: NDArray[np.float64], level: float = 0.95
 ) -> Exponent:
-    """Fit a least-squares line of log length over log distance, with an interval for its slope.
+    """Fit a least-squares line of log length over log distance, with an interval of its slope.
 
-    The interval is valid for unequal scatter.
+    The interval is also valid if the scatter is not equal at all distances.
 
     Args:
         squared: [V] squared gradient lengths of one block.
         distances: [V] camera distances, any unit.
         level: Confidence level.
 
-    Source: the paper, Proposition 1 (P1: larger for geometry than for amplitudes; P4: only if the
-    distance matches the visual scale); HC3 standard error, MacKinnon and White 1985.
+    Source: the paper, Proposition 1. Prediction P1: the exponent is larger for geometry than for
+    amplitudes. Prediction P4: this holds only if the distance matches the visual scale. Standard
+    error: HC3, MacKinnon and White 1985.
     """
     kept = (squared > 0.0) & (distances > 0.0)
     views = int(kept.sum())
@@ -132,16 +133,16 @@ def distance_exponent(
 
 
 def noise_scale(gramian: NDArray[np.float64], groups: Groups) -> float:
-    """Estimate tr(Sigma) / ||mean gradient||^2 of one block, both parts without bias.
+    """Estimate tr(Sigma) / ||mean gradient||^2 of one block; both parts are unbiased.
 
-    Well below the noise scale, K views per step are worth about as much as K steps; well above it,
-    further views are wasted. The mean and the variance refer to the mixture of the groups with
-    their shares. The result is infinite if the mean gradient cannot be distinguished from zero, and
-    NaN without variance.
+    If K is far below the noise scale, K views per step are worth about as much as K steps. If K is
+    far above the noise scale, further views are wasted. Mean and covariance Sigma refer to the
+    mixture of the two groups with their weights. The result is infinite if the mean gradient cannot
+    be distinguished from zero, and NaN if there is no variance.
 
     Args:
         gramian: [V, V] dot products of gradients.
-        groups: The near views, and the groups' shares.
+        groups: The near views, and the weights of the groups.
 
     Source: McCandlish et al. 2018, the simple noise scale.
     """
@@ -154,7 +155,7 @@ def noise_scale(gramian: NDArray[np.float64], groups: Groups) -> float:
 
 
 def _squared_mean(gramian: NDArray[np.float64], groups: Groups) -> float:
-    """Estimate ||p near mean + q far mean||^2 without bias."""
+    """Estimate ||p near mean + q far mean||^2 without bias; p and q are the group weights."""
     near, (n, m), (p, q) = groups.near, groups.sizes, groups.shares
     weights = np.where(near, p / n, q / m)
     plain = float(weights @ gramian @ weights)
@@ -170,20 +171,20 @@ def _squared_mean(gramian: NDArray[np.float64], groups: Groups) -> float:
 
 
 Row: TypeAlias = Mapping[str, str | int | float]
-#: Name of the part that concatenates all blocks into one vector.
+#: Name of the part that contains all blocks as one vector.
 ALL = "all"
-#: The paper's R_op+DC concatenates these two blocks.
+#: The paper's R_op+DC contains these two blocks as one vector.
 AMPLITUDES = ("opacities", "f_dc")
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """A block, or several blocks concatenated into one vector.
+    """A block, or several blocks that are concatenated into one vector.
 
     Attributes:
         name: Name of the part.
         kind: Kind of the part.
-        members: Indices of the part's blocks in the measurement.
+        members: Indices of the blocks of this part in the measurement.
     """
 
     name: str
@@ -201,8 +202,9 @@ def table(
 
     Args:
         measurement: The Gramians.
-        plan: The groups.
-        distances: Name -> [N] distance of every training view; an exponent is fitted to each.
+        plan: The probed views and their groups.
+        distances: Name of a distance -> [N] its values for every training view; an exponent is
+            fitted to each.
         seed: Seed of the bootstrap and of the permutations.
     """
     near = plan.near(measurement.views)
@@ -228,7 +230,7 @@ def table(
 
 
 def _parts(measurement: Measurement) -> Iterator[_Part]:
-    """Yield every block, the amplitudes concatenated, and all blocks concatenated."""
+    """Yield every block, then all amplitudes as one part, then all blocks as one part."""
     blocks = measurement.blocks
     for index, (name, kind) in enumerate(zip(blocks, measurement.kinds, strict=True)):
         yield _Part(name, kind, (index,))
@@ -246,7 +248,7 @@ def _block(
     plan: ProbePlan,
     rng: np.random.Generator,
 ) -> Row:
-    """Return conflict, ratios and variances of a part from its blocks' Gramians [M, V, V]."""
+    """Return conflict, ratios and variances of a part from the Gramians [M, V, V] of its blocks."""
     total = gramians.sum(axis=0)
     overlap: NDArray[np.bool_] = np.any(measurement.overlap[list(part.members)], axis=0)
     clashes = conflict(total[None], near, overlap[None])
@@ -283,7 +285,7 @@ def _distances(
     distances: Mapping[str, NDArray[np.float64]],
     rng: np.random.Generator,
 ) -> Row:
-    """Return the exponents, and the conflict against distance."""
+    """Return the exponents, and the relation between conflict and distance."""
     row: dict[str, str | int | float] = {}
     for name, values in distances.items():
         fit = distance_exponent(np.diag(gramian), values)
@@ -306,7 +308,10 @@ def per_pair_conflict(measurement: Measurement, near: NDArray[np.bool_]) -> floa
 
 
 def touched(rows: Sequence[Row]) -> list[Row]:
-    """Return the rows of blocks with variance; other blocks (inactive SH bands) have no values."""
+    """Return the rows of blocks with variance.
+
+    Other blocks, such as inactive SH bands, have no values.
+    """
     return [row for row in rows if float(row["sigma_w2"]) != 0.0]
 
 

@@ -1,4 +1,4 @@
-"""Probes of a run at an interval."""
+"""Gradient measurements of a run at an interval."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -30,16 +30,17 @@ from crossgrad_plugins.diagnostics.report import Report
 from crossgrad_plugins.diagnostics.table import Row, per_pair_conflict, table
 from crossgrad_plugins.groupings.heights import altitudes, upward
 
-#: Groupings that are also evaluated with the gradients of the same measurement (prediction P4 of
-#: the paper).
+#: Groupings that are evaluated with the gradients of the same measurement (prediction P4 of the
+#: paper).
 GROUPINGS = ("radial", "altitude", "footprint", "kmeans", "gmm")
 
 
 def distances_of(scene: Scene) -> dict[str, NDArray[np.float64]]:
-    """Return distances [N] of the training views, by name of the distance.
+    """Return distances [N] of the training views, by name of the kind of distance.
 
-    `radial`: distance from the mean camera, as in the paper. `depth`: median depth of the SfM
-    points divided by the focal length, relative to the median view; only if every view sees points.
+    Distance `radial` is the distance from the mean camera, as in the paper. Distance `depth` is the
+    median depth of the SfM points divided by the focal length, relative to the median view. It
+    exists only if every view sees points.
     """
     views = scene.train_views
     distances = {"radial": radial_distances(scene, views)}
@@ -50,10 +51,10 @@ def distances_of(scene: Scene) -> dict[str, NDArray[np.float64]]:
 
 
 def camera_rows(scene: Scene) -> list[Row]:
-    """Return the bimodality of heights and log-distances, and the variance of the distances."""
+    """Return the bimodality of heights and log-distances, and the variance of distances."""
     axis, source = upward(scene)
-    # Name -> values of a distance, and Var(r) / mean(r)^2. Heights have no such ratio, because
-    # their origin is arbitrary.
+    # Name -> values of a distance, and Var(r) / mean(r)^2 of the distance r. Heights have no
+    # relative variance, because their origin is arbitrary.
     heights = altitudes(scene, scene.train_views, axis)
     samples = {f"height ({source})": (heights, float("nan"))}
     for name, values in distances_of(scene).items():
@@ -76,9 +77,9 @@ def camera_rows(scene: Scene) -> list[Row]:
 
 
 def grouping_rows(scene: Scene, measurement: Measurement, seed: int) -> list[Row]:
-    """Return rows of one probe for several groupings.
+    """Return the rows of one probe for several groupings.
 
-    If a grouping cannot group the scene, its row gives the reason.
+    If a grouping cannot divide the scene, its row contains the reason.
     """
     rows: list[Row] = []
     for name, labels, reason in _groupings(scene, seed):
@@ -101,7 +102,7 @@ def grouping_rows(scene: Scene, measurement: Measurement, seed: int) -> list[Row
 
 
 def _groupings(scene: Scene, seed: int) -> Iterator[tuple[str, tuple[str, ...], str]]:
-    """Yield (name, labels, reason if none) of every grouping and of the scene's regimes."""
+    """Yield (name, labels, reason if there are no labels) of every grouping and of the regimes."""
     regimes = tuple(view.regime for view in scene.train_views)
     if len(set(regimes)) > 1:
         yield "regime", regimes, ""
@@ -115,7 +116,7 @@ def _groupings(scene: Scene, seed: int) -> Iterator[tuple[str, tuple[str, ...], 
 
 
 def _part(measurement: Measurement, places: list[int]) -> Measurement:
-    """Restrict a measurement to some of its views."""
+    """Reduce a measurement to some of its views."""
     square = np.ix_(range(len(measurement.blocks)), places, places)
     return Measurement(
         step=measurement.step,
@@ -154,13 +155,13 @@ def _read_by(
 
 @dataclass
 class Watch:
-    """An observer that probes the same views of the model at an interval, and at the end.
+    """Measures the gradients of chosen views at an interval and at the end of a run.
 
     Attributes:
-        plan: The views and their groups.
-        every: Steps between probes.
+        plan: The measured views and their groups.
+        every: Number of steps between two measurements.
         total: The last step of the run.
-        seed: Seed of the probes' own generator.
+        seed: Seed of the measurements' own generator.
         rows: The rows of the table so far.
         last: The last measurement.
     """
@@ -173,14 +174,14 @@ class Watch:
     last: Measurement | None = None
 
     def due(self, step: int) -> bool:
-        """Return True if a probe is due after this step."""
-        # Skip a measurement shortly before the end of the run, because another measurement is made
-        # at the end.
+        """Return True if a measurement is due after this step."""
+        # Skip a measurement shortly before the end of the run, because another one follows at the
+        # end.
         return step == self.total or (step % self.every == 0 and step <= self.total - self.every)
 
     @hookimpl
     def crossgrad_model_ready(self, model: Model) -> None:
-        """Probe the model if a probe is due."""
+        """Measure the gradients if a measurement is due."""
         if not self.due(model.phase.step):
             return
         start = perf_counter()
@@ -194,10 +195,10 @@ class Watch:
 
         Args:
             scene: The scene.
-            which: Description of the probed model.
+            which: Description of the measured model.
 
         Raises:
-            UserError: There was no probe.
+            UserError: No gradients were measured.
         """
         if self.last is None:
             raise UserError(

@@ -11,17 +11,18 @@ from crossgrad_plugins.exposures.light import mapped
 from crossgrad_plugins.exposures.per_photo import ExposurePerPhoto
 from crossgrad_plugins.exposures.srgb import EXPONENT, OFFSET, STRETCH
 
-#: An inverse with larger elements belongs to a map that (nearly) removes a colour and cannot be
-#: undone. Only values from files and very high learning rates lead to such maps.
+#: An inverse with larger elements belongs to a map that removes a colour almost completely. Such a
+#: map cannot be inverted; it occurs only in damaged files or with very high learning rates.
 _LARGEST_INVERSE = 1e3
-#: A map that turns white into black counts as this scale: 48 stops.
+#: Lower bound of the scale of a map, 48 stops below white; it also applies to a map that turns
+#: white into black.
 _DARKEST = 2.0**-20
 
 
 class Affine(ExposurePerPhoto):
-    """Each photo shows A x + b for the render's sRGB value x; the mean of all maps is the identity.
+    """Each photo shows A x + b for the sRGB value x of the render; the mean of all maps is neutral.
 
-    The twelve numbers per photo can also model effects other than exposure. Twelve numbers are
+    The map has twelve numbers per photo, so it can also model effects other than exposure. It is
     suitable for many photos with much overlap.
 
     Source: the exposure compensation of 3D Gaussian Splatting (2024).
@@ -35,7 +36,8 @@ class Affine(ExposurePerPhoto):
 
     @override
     def of_stops(self, stops: Tensor) -> Tensor:
-        # For all values except dark ones, a gain in linear light equals this map: s (x + o) - o.
+        # For all values except dark ones, a gain in linear light equals the map x -> scale (x +
+        # OFFSET) - OFFSET.
         scale = torch.exp2(stops / EXPONENT)[..., None, None]
         ones = torch.ones(3, 1, dtype=stops.dtype, device=stops.device)
         diagonal = torch.eye(3, dtype=stops.dtype, device=stops.device)
@@ -48,9 +50,9 @@ class Affine(ExposurePerPhoto):
 
     @override
     def shift(self, name: str, values: Tensor, start: Tensor, end: Tensor) -> Tensor:
-        # Do not add the difference of the maps: this would change the relative exposure of the
-        # photos and could make dark values negative. The new map applies `end` first, then the
-        # inverse of `start`, and then the map of the photo.
+        # Do not add the difference of the two maps, because a sum would change the relative
+        # exposure of photos and could make dark values negative. Instead, the new map applies
+        # `end`, then the inverse of `start`, and then the map of the photo.
         inverse, failed = torch.linalg.inv_ex(start[:, :3])
         if failed or not inverse.abs().max() < _LARGEST_INVERSE:
             return super().shift(name, values, start, end)

@@ -17,20 +17,20 @@ from crossgrad_plugins.exposures.tracks.gains import (
 class Auto(Exposure):
     """Uses `gain` if the brightness of SfM tracks requires it, else `none`.
 
-    The gains are fitted to the brightness of the training photos at SfM points. `gain` is used if
-    the standard deviation of the gains is at least 0.2 stops and at least four times its standard
-    error, and if the gains reduce the deviation of points that join different photos by at least 15
-    %.
+    Gains are fitted to the brightness of SfM points in the training photos. Three conditions select
+    `gain`. The standard deviation of the gains is at least 0.2 stops. It is at least four times its
+    standard error. The gains reduce the deviation of points that join different photos by at least
+    15 %.
     """
 
     @override
     def fitted_to(self, scene: Scene) -> Fitted:
         gains = deciding_gains(scene)
         if gains.differ:
-            # Import it here, because a run without exposure does not need it.
+            # Import the module here, because a run without exposure does not need it.
             from crossgrad_plugins.exposures.gain import Gain
 
-            # The messages of `Gain` contain the evidence.
+            # The messages of `Gain` show the evidence for this choice.
             return Fitted(Gain(), "gain", ("exposure auto: gain",))
         rule = (
             f"less than {LEAST_SPREAD} stops, {LEAST_RATIO:.0f} standard errors or "
@@ -45,7 +45,7 @@ class Auto(Exposure):
 
 
 class NoExposure(Exposure):
-    """Compares renders with photos directly; all photos are assumed to have the same exposure."""
+    """Compares renders with photos directly, as if all photos had the same exposure."""
 
     @override
     def apply(self, image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
@@ -53,7 +53,7 @@ class NoExposure(Exposure):
 
     @override
     def messages(self, scene: Scene, known: Mapping[str, Tensor]) -> tuple[str, ...]:
-        """Name the option that helps if SfM tracks show that photos differ in exposure."""
+        """Return a message with the option that helps if SfM tracks show different exposures."""
         if not any(len(view.seen) for view in scene.train_views):
             return ()
         from crossgrad_plugins.exposures.tracks.gains import deciding_gains

@@ -16,20 +16,21 @@ if TYPE_CHECKING:
 
 
 _IFD = 0x8769
-_TIME, _APERTURE, _SENSITIVITY = 33434, 33437, 34855  # ExposureTime, FNumber, ISOSpeedRatings
-#: Cameras write this value if the sensitivity does not fit into 16 bits.
+# Tags of ExposureTime, FNumber and ISOSpeedRatings.
+_TIME, _APERTURE, _SENSITIVITY = 33434, 33437, 34855
+#: Cameras write this ISO value if the sensitivity does not fit into 16 bits.
 _OVERFLOW = 65535
 
 
 def exposure_value(view: View) -> float | None:
-    """Return log2(t ISO / N^2) of a view's photo: its brightness for the same light, in stops.
+    """Return a photo's exposure log2(t ISO / N^2): its brightness at equal light, in stops.
 
     Args:
         view: The view; its photo need not come from a file.
 
     Returns:
-        Stops, comparable between photos of one camera. None if the file lacks exposure time t,
-        sensitivity or f-number N.
+        The exposure in stops, comparable between photos of one camera. None if the file lacks the
+        exposure time t, the sensitivity ISO or the f-number N.
     """
     photo = view.photo
     return _of_file(photo.source.path) if isinstance(photo, FilePhoto) else None
@@ -39,7 +40,7 @@ def _of_file(path: Path) -> float | None:
     try:
         with opened(path, "the photo's EXIF header cannot be read") as image:
             return _value(image)
-    except UserError:  # If the photo itself is damaged, decoding raises the error again.
+    except UserError:  # If the photo is damaged, decoding reports the error later.
         return None
 
 
@@ -64,15 +65,17 @@ def _positive(value: object) -> float | None:
     return number if isfinite(number) and number > 0.0 else None
 
 
-#: Number of headers that are read in parallel.
+#: Number of file headers that are read in parallel.
 _AT_ONCE = 4
-# The results are cached, because a run requests the values at every evaluation and a scene does not
-# change.
+# Cache of the values, because a run needs them at every evaluation and a scene does not change.
 _KNOWN: "WeakKeyDictionary[Scene, Mapping[str, float]]" = WeakKeyDictionary()
 
 
 def exposure_values(scene: Scene) -> Mapping[str, float]:
-    """Return log2(t ISO / N^2) of all photos with EXIF exposure, by name; read once per scene."""
+    """Return log2(t ISO / N^2) of all photos with EXIF exposure, by name.
+
+    Each scene is read only once.
+    """
     by_name = _KNOWN.get(scene)
     if by_name is None:
         with ThreadPoolExecutor(_AT_ONCE) as pool:

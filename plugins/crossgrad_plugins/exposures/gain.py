@@ -12,10 +12,10 @@ from crossgrad_plugins.exposures.per_photo import ExposurePerPhoto
 
 
 class Gain(ExposurePerPhoto):
-    """Each photo shows 2^stops times the light of the scene; the mean of all stops is 0.
+    """Each photo shows 2^stops times the light of the scene; the mean of the stops is 0.
 
-    The render is decoded from sRGB, multiplied, and encoded again. Shutter, aperture and
-    sensitivity of a camera with automatic exposure have the same effect.
+    The sRGB values of the render are converted to linear light, multiplied and converted back. The
+    shutter, aperture and sensitivity of a real camera change the light by such a factor, too.
     """
 
     parameter: ClassVar[str] = "stops"
@@ -42,7 +42,7 @@ class Gain(ExposurePerPhoto):
 
 
 class ChannelGain(ExposurePerPhoto):
-    """Like `gain`, with separate stops for red, green and blue: exposure and white balance."""
+    """Like `gain`, but with separate stops for red, green and blue, to model white balance."""
 
     parameter: ClassVar[str] = "stops"
 

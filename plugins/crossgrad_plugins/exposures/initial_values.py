@@ -18,32 +18,32 @@ if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 
-#: Source of the initial exposure values.
+#: Sources of the initial exposure values.
 Start: TypeAlias = Literal["auto", "tracks", "exif", "none"]
-#: Photos whose exposure differs from the mean by more than this many stops share few usable values
-#: with other photos.
+#: Photos are reported if their exposure differs from the mean by more than this many stops, because
+#: their usable pixel values hardly overlap with other photos.
 _FAR = 4.0
 _NAMED = 3
 #: Maximum number of neighbouring photos that predict the exposure of a photo.
 TELLING = 4
-#: With at most this number of photos, neighbours and regimes predict every photo equally well.
+#: With at most this number of photos, neighbours and regimes cannot be compared as predictors.
 _SAME = 2
-#: Smaller distances are replaced by this distance, so that a photo taken twice does not outweigh
-#: all other photos.
+#: Lower bound of a distance between photos, so that a photo that was taken twice does not get all
+#: the weight.
 _NEAREST = 1e-3
 _Floats: TypeAlias = NDArray[np.float64]
-# The results are cached, because a run requests each held-out photo at every evaluation, and scenes
-# do not change.
+# Cache of the neighbours, because a run predicts each held-out photo at every evaluation, and
+# scenes do not change.
 _KNOWN: "WeakKeyDictionary[Scene, Neighbours]" = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False)
 class Starts:
-    """The initial gains.
+    """The initial gains of the training photos.
 
     Attributes:
         stops: [P] stops above the mean of the training photos.
-        messages: The source of the gains, and unusual photos.
+        messages: Lines of the log about the source of the gains and about unusual photos.
     """
 
     stops: NDArray[np.float64]
@@ -55,7 +55,8 @@ def starts_of(scene: Scene, start: Start) -> Starts:
 
     Args:
         scene: The scene.
-        start: `tracks` or `exif` alone; `auto` for both, with tracks first; `none` for 0.
+        start: `tracks` or `exif` for one source; `auto` for both, first tracks; `none` for gains of
+            0.
     """
     names = [view.name for view in scene.train_views]
     if len(names) == 1:
@@ -91,7 +92,7 @@ def starts_of(scene: Scene, start: Start) -> Starts:
 
 
 def _beside(exif_stops: dict[str, float], of_tracks: dict[str, float]) -> dict[str, float]:
-    """Shift EXIF's stops to the scale of the tracks; without common photos, to a mean of 0."""
+    """Shift stops from EXIF to the scale of the tracks; without common photos, to a mean of 0."""
     if not exif_stops:
         return {}
     both = [of_tracks[name] - value for name, value in exif_stops.items() if name in of_tracks]
@@ -100,7 +101,7 @@ def _beside(exif_stops: dict[str, float], of_tracks: dict[str, float]) -> dict[s
 
 
 def _filled(stops: NDArray[np.float64], views: Sequence[View]) -> tuple[NDArray[np.float64], str]:
-    """Replace NaN by predictions of neighbours or regimes; return the source, too."""
+    """Replace NaN by the prediction of neighbours or regimes, and return the kind of prediction."""
     known_rows = np.flatnonzero(~np.isnan(stops)).tolist()
     of_regime = "the mean of their regime"
     if not len(known_rows):
@@ -128,7 +129,7 @@ def _reported_by(source: str, names: Sequence[str]) -> Iterable[str]:
 
 
 def outliers(names: Sequence[str], stops: Iterable[float]) -> Iterable[str]:
-    """Yield a message if the stops of some photos are far from the mean."""
+    """Yield a message if some photos have stops far from the mean."""
     far = [name for name, stop in zip(names, stops, strict=True) if abs(stop) > _FAR]
     if far:
         yield (
@@ -144,10 +145,11 @@ def _some(names: Sequence[str]) -> str:
 
 
 class Neighbours:
-    """Photos by their camera's position and viewing direction.
+    """Predictions of a photo's values from the photos with similar camera poses.
 
-    The squared distance of two cameras is the squared distance of their centres, in units of the
-    median distance from the middle, plus the squared distance of their unit viewing directions.
+    The squared distance of two cameras is the sum of two terms. The first is the squared distance
+    of their centres, in units of the median distance from the middle. The second is the squared
+    distance of their unit viewing directions.
     """
 
     def __init__(self, views: Sequence[View]) -> None:
@@ -160,20 +162,20 @@ class Neighbours:
         self._regimes = np.unique([view.regime for view in views], return_inverse=True)[1]
 
     def rows_and_weights(self, camera: Camera) -> tuple[NDArray[np.int64], _Floats]:
-        """Return the photos [N] that predict a photo with this camera, and weights of sum 1."""
+        """Return the photos [N] that predict a photo of this camera, and weights of sum 1."""
         rows, weights = self._told(self._place(camera)[None], min(TELLING, len(self._places)))
         return rows[0], weights[0]
 
     def errors(self, values: _Floats) -> tuple[float, float]:
-        """Return the leave-one-out errors of the values of the photos, as root mean square.
+        """Return the root mean square leave-one-out errors of two predictions.
 
         Args:
-            values: [P, V] of the photos, P > 1.
+            values: [P, V] values of the photos, P > 1.
 
         Returns:
-            The error of the prediction by neighbours, and the error of the mean over the other
-            photos of the regime. For a photo alone in its regime, the mean of all other photos is
-            used.
+            The error of the prediction by neighbours, and the error of the prediction by the mean
+            of the other photos in the regime. If a regime has only one photo, the mean of all other
+            photos is used.
         """
         rows, weights = self._others
         near = (weights[..., None] * values[rows]).sum(axis=1)
@@ -205,7 +207,8 @@ class Neighbours:
         """The other photos [P, N] that predict each photo, and their weights."""
         count = min(TELLING + 1, len(self._places))
         rows, weights = self._told(self._places, count)
-        # Photos at the same position can be in any order, so exclude the photo wherever it appears.
+        # Photos at one position come in any order, so remove the photo itself wherever it is in the
+        # list.
         weights[rows == np.arange(len(rows))[:, None]] = 0.0
         return rows, weights / weights.sum(axis=1, keepdims=True)
 
@@ -221,7 +224,7 @@ class Neighbours:
         return rows, weights / weights.sum(axis=1, keepdims=True)
 
     def _means(self, values: _Floats) -> _Floats:
-        """Return the means [P, V] over the other photos of each photo's regime."""
+        """Return the means [P, V] of the values of the other photos in each photo's regime."""
         sums = np.zeros((self._regimes.max() + 1, values.shape[1]))
         np.add.at(sums, self._regimes, values)
         counts = np.bincount(self._regimes)[self._regimes][:, None]
@@ -231,7 +234,7 @@ class Neighbours:
 
 
 def neighbours_of(scene: Scene) -> Neighbours:
-    """Return the neighbours among the training photos of a scene; computed once per scene."""
+    """Return the neighbours among the training photos of a scene, from the cache if possible."""
     neighbours = _KNOWN.get(scene)
     if neighbours is None:
         neighbours = _KNOWN[scene] = Neighbours(scene.train_views)

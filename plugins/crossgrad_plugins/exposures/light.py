@@ -1,4 +1,4 @@
-"""Gains and affine maps of images: compiled on the CPU in float32, plain torch elsewhere."""
+"""Gains and affine maps of images: compiled kernels on the CPU in float32, else plain torch."""
 
 from typing import Any
 
@@ -12,7 +12,9 @@ from crossgrad_plugins.exposures import srgb
 
 
 def with_gain(image: Tensor, stops: Tensor) -> Tensor:
-    """Return the image with 2^stops times the light; it is decoded from sRGB and encoded again.
+    """Return the image with 2^stops times the light.
+
+    The sRGB values are converted to linear light and back.
 
     Args:
         image: [H, W, 3] sRGB values, also outside [0, 1].
@@ -25,11 +27,11 @@ def with_gain(image: Tensor, stops: Tensor) -> Tensor:
 
 
 def mapped(image: Tensor, matrix: Tensor) -> Tensor:
-    """Return A x + b of every pixel x, in sRGB values.
+    """Return A x + b for the sRGB values x of every pixel.
 
     Args:
         image: [H, W, 3] sRGB values.
-        matrix: [3, 4], the matrix [A | b].
+        matrix: [3, 4] the matrix [A | b].
     """
     if not _is_compiled(image, matrix):
         return image @ matrix[:, :3].T + matrix[:, 3]
@@ -95,5 +97,5 @@ class _Affine(torch.autograd.Function):
 
 
 def _flat(tensor: Tensor) -> np.ndarray[Any, Any]:
-    """Return the numbers of a contiguous tensor without a graph, as shared memory."""
+    """Return a contiguous tensor as a flat NumPy array that shares its memory, without a graph."""
     return tensor.view(-1).numpy()

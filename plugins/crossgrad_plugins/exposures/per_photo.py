@@ -1,4 +1,4 @@
-"""Base class of exposures with values per photo: start, learning rates, unseen photos."""
+"""Base class of exposures with values per photo: start, learning rates, held-out photos."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -17,9 +17,9 @@ from crossgrad_plugins.exposures.initial_values import Start, neighbours_of, out
 class ExposurePerPhoto(Exposure):
     """An exposure with one parameter that has a value for every training photo.
 
-    Values start from the gains of SfM tracks or EXIF, and have their own learning rates. The mean
-    of the parameters over the training photos is kept neutral, so that the brightness and colours
-    of the scene do not drift.
+    The initial values follow from SfM tracks or EXIF; the values have separate learning rates. The
+    mean of the values over the training photos is kept neutral, so that brightness and colours of
+    the scene do not drift.
 
     Attributes:
         parameter: Name of the parameter.
@@ -39,7 +39,7 @@ class ExposurePerPhoto(Exposure):
 
     @abstractmethod
     def of_stops(self, stops: Tensor) -> Tensor:
-        """Return the values [..., V] for gains in stops [...]."""
+        """Return the values [..., V] that correspond to gains of so many stops [...]."""
 
     @abstractmethod
     def in_stops(self, values: Tensor) -> Tensor:
@@ -47,11 +47,11 @@ class ExposurePerPhoto(Exposure):
 
     @abstractmethod
     def beside(self, values: Tensor, stops: Tensor) -> Tensor:
-        """Return the values [P, V] of photos that differ from `values` by stops [P]."""
+        """Return the values [P, V] of photos that are brighter than `values` by stops [P]."""
 
     @abstractmethod
     def neutral(self) -> Tensor:
-        """Return the mean that the values are kept at."""
+        """Return the neutral values, which are the mean over the training photos."""
 
     @override
     def per_photo(self, scene: Scene) -> Mapping[str, PerPhoto]:
@@ -74,7 +74,7 @@ class ExposurePerPhoto(Exposure):
         return {name: self._centred(value.double()) for name, value in values.items()}
 
     def _centred(self, values: Tensor) -> Tensor:
-        """Shift the values [P, V], in float64, to a neutral mean; return them in float32."""
+        """Shift the values [P, V] to a neutral mean in float64; return them in float32."""
         neutral = self.neutral().to(values, non_blocking=True)
         return self.shift(self.parameter, values, values.mean(dim=0), neutral).float()
 
@@ -82,17 +82,18 @@ class ExposurePerPhoto(Exposure):
     def predict_unseen(
         self, view: View, scene: Scene, values: Mapping[str, Tensor]
     ) -> Mapping[str, Tensor]:
-        """Predict by EXIF if view and training photos have EXIF data; else by neighbours or regime.
+        """Predict the values of a photo that was not trained.
 
-        Neighbours are the training photos nearest in pose. The neighbours are used if they predict
-        each other better than the mean over a regime does.
+        EXIF data are used if this photo and the training photos have them; else neighbours or the
+        regime. Neighbours are the training photos nearest in pose. Neighbours are used if they
+        predict each other better than the mean of a regime does.
         """
         exif = exposure_values(scene)
         trained = values[self.parameter]
         rows = [row for row, photo in enumerate(scene.train_views) if photo.name in exif]
         if view.name in exif and rows:
-            # Use photos of the same regime, because sensors differ and a regime often has its own
-            # sensor.
+            # Use only photos of the same regime, because regimes are often taken with different
+            # sensors.
             rows = [row for row in rows if scene.train_views[row].regime == view.regime] or rows
             stops = [exif[view.name] - exif[scene.train_views[row].name] for row in rows]
             shift = self.beside(trained[rows], torch.tensor(stops).to(trained))
@@ -105,7 +106,7 @@ class ExposurePerPhoto(Exposure):
         return {self.parameter: torch.tensordot(shares, trained[torch.from_numpy(near)], dims=1)}
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """Report `decay` as unused if the rate is 0."""
+        """Report `decay` as unused if the learning rate is 0."""
         if self.rate:
             return {}
         return {"decay": "exposure.rate is 0: the values do not change"}

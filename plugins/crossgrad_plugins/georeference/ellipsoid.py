@@ -1,4 +1,4 @@
-"""Positions on the ellipsoid of WGS 84, geocentric coordinates, and local east, north and up."""
+"""Positions on the ellipsoid WGS 84, geocentric coordinates, and local east, north and up."""
 
 import math
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ class Place:
 
     @property
     def to_enu(self) -> Frame3D:
-        """The frame change from geocentric coordinates to metres east, north and up from here."""
+        """The conversion from geocentric coordinates to east, north and up of this position."""
         sine, cosine, sine_l, cosine_l = (
             *(math.sin(math.radians(self.latitude)), math.cos(math.radians(self.latitude))),
             *(math.sin(math.radians(self.longitude)), math.cos(math.radians(self.longitude))),
@@ -50,7 +50,7 @@ class Place:
 
 
 def geocentric(places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return geocentric coordinates [N, 3] in metres of latitudes, longitudes (deg), altitudes."""
+    """Return geocentric coordinates [N, 3], m, of latitudes, longitudes (degrees) and altitudes."""
     latitude, longitude = np.radians(places[:, :2]).T
     bend = _AXIS / np.sqrt(1 - _ECCENTRICITY * np.sin(latitude) ** 2)
     around = (bend + places[:, 2]) * np.cos(latitude)
@@ -69,7 +69,8 @@ def place_at(point: NDArray[np.float64]) -> Place | None:
         bend = _AXIS / math.sqrt(1 - _ECCENTRICITY * math.sin(latitude) ** 2)
         latitude = math.atan2(z + _ECCENTRICITY * bend * math.sin(latitude), around)
     sine, cosine = math.sin(latitude), math.cos(latitude)
-    # The altitude along the vertical. This formula also holds at the poles and at the equator.
+    # Compute the altitude along the vertical. This formula also holds at the poles and at the
+    # equator.
     flat = _AXIS * math.sqrt(1 - _ECCENTRICITY * sine**2)
     altitude = around * cosine + z * sine - flat
     return Place(math.degrees(latitude), math.degrees(math.atan2(y, x)), altitude)

@@ -1,7 +1,7 @@
-"""Similarities between two frames of the world, known or fitted to points.
+"""Similarities between two coordinate frames, known or fitted to points.
 
-Source of the least-squares similarity: Umeyama 1991; of the search among triples by their median
-residual: Rousseeuw 1984.
+Source: Umeyama 1991 for the least-squares similarity; Rousseeuw 1984 for the search among triples
+of points by their median residual.
 """
 
 from dataclasses import dataclass
@@ -10,36 +10,37 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-#: Maximum deviation of a rotation matrix whose digits were rounded. The matrix is made orthonormal
-#: again.
+#: Maximum deviation of a matrix from a rotation, because its digits may be rounded. The matrix is
+#: then made orthonormal.
 _ROUNDED: Final = 1e-3
 _EXACT: Final = 1e-12
 _LAST_ROW: Final = np.array([0.0, 0.0, 0.0, 1.0])
-#: Minimum number of points for a fit with a residual, and minimum number for rejecting outliers.
+#: Minimum number of points for a fit with residuals, and minimum number for the rejection of
+#: outliers.
 FEWEST, _FEWEST_TO_REJECT = 3, 8
-#: Number of triples of points that are tried, maximum number of points per trial, and maximum
-#: number of rejection passes.
+#: Number of tried triples of points, maximum number of points per trial, and maximum number of
+#: passes that reject outliers.
 _TRIPLES, _MOST_TRIED, _PASSES = 500, 100, 50
-#: A residual is an outlier if it exceeds this many medians. If two axes have equal errors, one of
-#: 10^5 normal errors exceeds this limit. If three axes have equal errors, fewer exceed it.
+#: A point is an outlier if its residual is above this multiple of the median residual. If the
+#: errors along two axes are equal, one of 10^5 normal errors is above this limit. If the errors
+#: along three axes are equal, fewer errors are above it.
 _FAR: Final = 4.0
-#: Residuals below this share of the extent are rounding errors.
+#: Residuals below this share of the points' extent are rounding errors.
 _ROUNDING: Final = 1e-9
-#: Maximum standard error in radians of the rotation about the longest extent of the points.
+#: Maximum standard error, in radians, of the rotation about the longest axis of the points.
 _LARGEST_TILT: Final = np.radians(10.0)
-#: Points count as collinear if their distance from a line is below this share of their extent, even
-#: if the points are exact.
+#: Points count as collinear if their distances from a line are below this share of their extent.
 _THINNEST: Final = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
 class Frame3D:
-    """A similarity from one frame of the world to another: x' = scale * rotation x + shift.
+    """A similarity between two coordinate frames: x' = scale * rotation x + shift.
 
     Attributes:
-        rotation: [3, 3].
-        shift: [3].
-        scale: The scale, above zero.
+        rotation: [3, 3] rotation matrix.
+        shift: [3] translation.
+        scale: The scale factor, above zero.
     """
 
     rotation: NDArray[np.float64]
@@ -51,7 +52,7 @@ class Frame3D:
         return np.asarray(self.scale * (points @ self.rotation.T) + self.shift)
 
     def after(self, first: "Frame3D") -> "Frame3D":
-        """Return both similarities as one similarity: first `first`, then this similarity."""
+        """Return the similarity that applies `first` and then this similarity."""
         return Frame3D(
             self.rotation @ first.rotation,
             self.points(first.shift[None])[0],
@@ -60,7 +61,7 @@ class Frame3D:
 
     @property
     def inverse(self) -> "Frame3D":
-        """The similarity in the opposite direction."""
+        """The inverse similarity."""
         turned = self.rotation.T
         return Frame3D(turned, -turned @ self.shift / self.scale, 1.0 / self.scale)
 
@@ -78,10 +79,10 @@ SAME: Final = Frame3D(np.eye(3), np.zeros(3))
 def rotation_of(matrix: NDArray[np.float64]) -> NDArray[np.float64] | None:
     """Return the rotation [3, 3] nearest to a matrix; None if the matrix is not a rotation.
 
-    The matrix may deviate by the rounding of its digits. A matrix that is orthonormal in the
-    precision of float64 is returned unchanged.
+    The elements of the matrix may be rounded. A matrix that is orthonormal up to float64 rounding
+    is returned unchanged.
     """
-    # Overflow and NaN also fail the test below.
+    # A matrix with infinite or NaN elements also fails this test.
     with np.errstate(over="ignore", invalid="ignore"):
         off = np.abs(matrix.T @ matrix - np.eye(3)).max()
     if not off <= _ROUNDED or np.linalg.det(matrix) < 0.0:
@@ -93,7 +94,7 @@ def rotation_of(matrix: NDArray[np.float64]) -> NDArray[np.float64] | None:
 
 
 def similarity_of(matrix: NDArray[np.float64]) -> Frame3D | None:
-    """Return the similarity of a matrix [4, 4]; None if it stretches unevenly or mirrors."""
+    """Return the similarity of a matrix [4, 4]; None if it mirrors or scales axes unequally."""
     with np.errstate(over="ignore", invalid="ignore"):
         scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     if not 0.0 < scale < np.inf or np.abs(matrix[3] - _LAST_ROW).max() > 0.0:
@@ -104,13 +105,13 @@ def similarity_of(matrix: NDArray[np.float64]) -> Frame3D | None:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A similarity fitted from points to measured points.
+    """A similarity that was fitted from points to measured points.
 
     Attributes:
         frame: The similarity.
-        errors: [N, 3] measured minus fitted, in the frame of the measured points.
-        kept: [N] bool, True for the points used in the fit.
-        tilt: Standard error of the rotation about the longest extent of the points, radians.
+        errors: [N, 3] measured minus fitted coordinates, in the frame of the measured points.
+        kept: [N] bool, True for points that were used in the fit.
+        tilt: Standard error of the rotation about the longest axis of the points, radians.
     """
 
     frame: Frame3D
@@ -120,10 +121,10 @@ class Fit:
 
 
 def fit_similarity(points: NDArray[np.float64], measured: NDArray[np.float64]) -> Fit | str:
-    """Fit the similarity from points [N, 3] to measured points [N, 3], or return why it fails.
+    """Fit the similarity from points [N, 3] to measured points [N, 3], or return why this fails.
 
-    The result is deterministic. With eight points or more, outliers are rejected, as long as more
-    than half of the points agree.
+    The result is deterministic. With eight points or more, outliers are rejected if more than half
+    of the points agree with each other.
     """
     if len(points) < FEWEST:
         return f"there are {len(points)} of them, but at least {FEWEST} are needed"
@@ -132,8 +133,8 @@ def fit_similarity(points: NDArray[np.float64], measured: NDArray[np.float64]) -
         kept = _agreeing(points, measured)
     frame = _frame(points[kept], measured[kept])
     errors = measured - frame.points(points)
-    # The similarity has seven parameters. Three points therefore leave two of their nine degrees of
-    # freedom.
+    # A similarity has seven parameters. Three points have nine coordinates, so only two degrees of
+    # freedom remain for the residuals.
     sigma = float(np.sqrt((errors[kept] ** 2).sum() / (3 * int(kept.sum()) - 7)))
     posed = frame.scale * (points[kept] - points[kept].mean(axis=0))
     along, *across = np.linalg.svd(posed, compute_uv=False)
@@ -147,19 +148,18 @@ def fit_similarity(points: NDArray[np.float64], measured: NDArray[np.float64]) -
 
 
 def _agreeing(points: NDArray[np.float64], measured: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return the points [N], as bool, that agree with each other."""
+    """Return [N] bool, True for points that agree with each other."""
     rng = np.random.default_rng(0)
     triples = np.argsort(rng.random((_TRIPLES, len(points))), axis=1)[:, :FEWEST]
     rotations, shifts, scales = _fitted(points[triples], measured[triples])
     subset = slice(None, None, -(-len(points) // _MOST_TRIED))
     fitted = scales[:, None, None] * (points[subset] @ rotations.transpose(0, 2, 1))
-    tried = np.linalg.norm(measured[subset] - fitted - shifts[:, None], axis=2)  # [S, n]
+    tried = np.linalg.norm(measured[subset] - fitted - shifts[:, None], axis=2)
     medians = np.median(tried, axis=1)
     best = int(np.argmin(medians))
     frame = Frame3D(rotations[best], shifts[best], float(scales[best]))
     least = _ROUNDING * float(np.abs(measured - measured.mean(axis=0)).max())
-    # The new residuals have other rounding errors than before, but at least half of the points must
-    # remain.
+    # Residuals change by rounding errors, but at least half of the points must stay.
     half = max(float(medians[best]) * (1.0 + _ROUNDING), least)
     kept = np.linalg.norm(measured - frame.points(points), axis=1) <= half
     for _ in range(_PASSES):
@@ -184,7 +184,7 @@ def _fitted(
     middle, aim = points.mean(axis=1), measured.mean(axis=1)
     source, target = points - middle[:, None], measured - aim[:, None]
     left, sizes, right = np.linalg.svd(target.transpose(0, 2, 1) @ source)
-    # A mirrored solution is corrected along its shortest axis.
+    # If the solution is mirrored, flip its shortest axis.
     signs = np.ones_like(sizes)
     signs[:, 2] = np.sign(np.linalg.det(left @ right))
     rotations = (left * signs[:, None]) @ right

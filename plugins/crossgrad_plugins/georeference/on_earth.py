@@ -13,8 +13,8 @@ from crossgrad_plugins.georeference.ellipsoid import Place
 from crossgrad_plugins.georeference.frames import SAME, Frame3D
 from crossgrad_plugins.georeference.projection import Projection, utm_code
 
-#: Statistics of the distances between photos and their GPS positions in metres: in 3-D, along the
-#: ground, and vertically.
+#: Root mean square distances between photos and their GPS positions, in metres: in 3D, horizontal
+#: and vertical.
 RESIDUALS: Final = ("median", "rms", "max", "rms_horizontal", "rms_vertical")
 _CONVENTION: Final = (
     "position = numbers of the file + offset; [east, north, up, 1] = transform [position, 1], "
@@ -28,14 +28,16 @@ class OnEarth:
     """A scene with a known position on Earth.
 
     Attributes:
-        origin: The origin of east, north, up.
-        to_enu: Maps the coordinates of the scene's input to metres east, north and up from the
+        origin: The origin of the coordinates east, north and up.
+        to_enu: Conversion from the coordinates of the input to metres east, north and up of the
             origin.
-        source: The source of the georeference.
-        residuals: Name from `RESIDUALS` -> metres; empty if there was nothing to compare.
-        system: The coordinate system of the input, if the input is in map coordinates. Map
-            coordinates are not a similarity of east, north, up: the coordinate system converts the
-            centres, and `to_enu` is the best fit at the origin.
+        source: The source of the georeference, as text.
+        residuals: Name from `RESIDUALS` -> metres; empty if there was no GPS position to compare
+            with.
+        system: The coordinate system of the input, or None if the input has no map coordinates. The
+            conversion from map coordinates to east, north and up is not a similarity. The
+            coordinate system therefore converts the centres, and `to_enu` is the best similarity at
+            the origin.
     """
 
     origin: Place
@@ -46,7 +48,7 @@ class OnEarth:
 
     @property
     def note(self) -> str:
-        """One sentence for the user; see `crossgrad_core.plugin.Georeference`."""
+        """One sentence about the georeference; see `crossgrad_core.plugin.Georeference`."""
         parts = [f"{name.replace('_', ' ')} {m:.2f} m" for name, m in self.residuals.items()]
         residual_text = f"; residuals: {', '.join(parts)}" if parts else ""
         return (
@@ -60,7 +62,7 @@ class OnEarth:
         return np.asarray(self.to_enu.rotation[2])
 
     def placed(self, gaussians: Gaussians, similarity: Similarity, coordinates: str) -> Placed:
-        """See `crossgrad_core.plugin.Georeference`."""
+        """Return the model in map coordinates; see `crossgrad_core.plugin.Georeference`."""
         facts = {**self._facts(), "coordinates": coordinates}
         centers = similarity.to_input(_means(gaussians))
         here = self._enu_of(centers)
@@ -93,7 +95,7 @@ class OnEarth:
         return replace(placed, notes=projection.messages)
 
     def _enu_of(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Convert points [N, 3] of the input to metres east, north, up from the origin [N, 3]."""
+        """Convert points [N, 3] of the input to metres east, north and up of the origin."""
         if self.system is None:
             return self.to_enu.points(points)
         return self.origin.to_enu.points(self.system.geocentric(points))
@@ -106,10 +108,11 @@ class OnEarth:
         points: NDArray[np.float64],
         facts: dict[str, Json],
     ) -> Placed:
-        """Return Gaussians at `points` [N, 3], rotated and scaled by a similarity from the input.
+        """Return Gaussians at `points` [N, 3].
 
-        The Gaussians get a separate frame, which is rotated against the local frame and has the
-        same size, so that an exporter only moves and scales them.
+        A similarity from the input frame rotates and scales them. The Gaussians get a new frame
+        with the size of the local frame and another rotation, so that an exporter only has to move
+        and scale them.
         """
         offset = frame.points(similarity.offset[None])[0]
         frame_similarity = Similarity(offset, similarity.scale / frame.scale)
@@ -127,7 +130,7 @@ class OnEarth:
         return self.origin.to_enu.inverse.after(self.to_enu).after(frame.inverse).matrix
 
     def _facts(self) -> dict[str, Json]:
-        """Return the facts that hold in any coordinates."""
+        """Return the facts that are true in any coordinate system."""
         residuals: dict[str, Json] = dict(self.residuals)
         return {
             "crs": None,
@@ -138,7 +141,7 @@ class OnEarth:
         }
 
     def _ways(self, frame: Frame3D) -> dict[str, Json]:
-        """Return the matrices of a file in the coordinates to which `frame` maps the input."""
+        """Return a file's matrices, for the coordinates to which `frame` converts the input."""
         back = frame.inverse
         to_enu = self.to_enu.after(back)
         return {
@@ -153,9 +156,9 @@ def _means(gaussians: Gaussians) -> NDArray[np.float64]:
 
 
 def _apart(points: NDArray[np.float64], others: NDArray[np.float64]) -> float | None:
-    """Return the distance between two sets of points [N, 3]; None without finite distances.
+    """Return the distance between two sets of points [N, 3]; None if no distance is finite.
 
-    The distance is the 99th percentile, because the farthest points may be at the horizon.
+    The 99th percentile of the distances is used, because the farthest points may be at the horizon.
     """
     off = np.linalg.norm(points - others, axis=1)
     off = off[np.isfinite(off)]

@@ -1,4 +1,4 @@
-"""Map coordinates, by their EPSG codes."""
+"""Map coordinates, given by their EPSG codes."""
 
 import re
 from dataclasses import dataclass
@@ -16,23 +16,25 @@ if TYPE_CHECKING:
 
 _CODE: Final = re.compile(r"epsg:[0-9]{1,6}", re.IGNORECASE | re.ASCII)
 _SHOWN: Final = 80
-#: Geocentric coordinates of WGS 84.
+#: EPSG code of geocentric coordinates on WGS 84.
 GEOCENTRIC: Final = "epsg:4978"
-#: Distance in metres on both sides of a point. The projection is linearized between these two ends.
+#: Distance in metres from a point to both ends of the interval over which the projection is
+#: linearized.
 _NEAR: Final = 10.0
-#: No message is needed if the accuracy in metres is better than this.
+#: A message about accuracy is printed only if the accuracy in metres is worse than this.
 _KNOWN_WELL: Final = 1.0
-#: Maximum relative difference of scale between directions. In a UTM zone, the difference is 0.001.
+#: Maximum relative difference of the scale between directions. Within a UTM zone, the difference is
+#: at most 0.001.
 _UNEVEN: Final = 0.005
 
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """A coordinate reference system with metres or another unit of length on all axes.
+    """A coordinate reference system whose axes all have units of length.
 
     Attributes:
         code: The code, such as `epsg:32633`.
-        forward: Converts geocentric coordinates; for a map, x is east and y is north.
+        forward: Conversion from geocentric coordinates; on a map, x is east and y is north.
         accuracy: Accuracy in metres relative to WGS 84; None if PROJ does not report it.
     """
 
@@ -42,16 +44,16 @@ class Projection:
 
     @classmethod
     def of(cls, code: str, where: str) -> "Projection":
-        """Return the system of a code.
+        """Return the coordinate system of a code.
 
         Args:
             code: A code such as `epsg:32633`.
-            where: Origin of the request, for error messages.
+            where: Option or file that contains the code, for error messages.
 
         Raises:
-            UserError: The code is invalid or unknown, or a grid or pyproj is missing.
+            UserError: The code is invalid or unknown, or pyproj or a grid file is missing.
         """
-        # Accept only codes, because other strings that PROJ accepts could name any file.
+        # Accept only codes, because PROJ would also accept strings that name an arbitrary file.
         if not _CODE.fullmatch(code):
             raise _unknown(where, repr(code)[:_SHOWN])
         try:
@@ -73,12 +75,12 @@ class Projection:
 
     @property
     def facts(self) -> dict[str, Json]:
-        """The entries of `.georef.json` for a file in this system."""
+        """The entries of `.georef.json` for a file in this coordinate system."""
         return {"crs": self.code.upper(), "crs_accuracy_m": self.accuracy}
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """Messages about the accuracy of coordinates in this system."""
+        """Messages about the accuracy of coordinates in this coordinate system."""
         if self.accuracy is None:
             return (
                 (
@@ -91,7 +93,7 @@ class Projection:
         return ()
 
     def points(self, geocentric: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Convert geocentric coordinates [N, 3] to this system [N, 3]; infinite if undefined."""
+        """Convert geocentric coordinates [N, 3] to this system, [N, 3]; infinite if undefined."""
         return np.column_stack(self.forward.transform(*geocentric.T))
 
     def geocentric(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -100,15 +102,16 @@ class Projection:
         return np.where(np.isfinite(converted), converted, np.nan)
 
     def near(self, to_enu: Frame3D, place: NDArray[np.float64], where: str) -> Frame3D:
-        """Fit the similarity from east, north, up to this system around a place.
+        """Fit the similarity from east, north and up to this coordinate system near a position.
 
         Args:
-            to_enu: Converts geocentric coordinates.
-            place: [3] in east, north, up.
-            where: Origin of the request, for error messages.
+            to_enu: Conversion from geocentric coordinates to east, north and up.
+            place: [3] the position in east, north and up.
+            where: Option or file that contains the code, for error messages.
 
         Raises:
-            UserError: Around this position the system stretches unevenly, mirrors, or is undefined.
+            UserError: Near the position, the coordinate system is undefined, mirrors, or has
+                different scales along its axes.
         """
         ends = place + _NEAR * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
         here, *sides = self.points(to_enu.inverse.points(ends))
@@ -148,6 +151,6 @@ def _unknown(where: str, reason: str) -> UserError:
 
 
 def utm_code(place: Place) -> str:
-    """Return the EPSG code of a place's UTM zone (WGS 84), without the exceptions of Norway."""
+    """Return the EPSG code of a position's UTM zone, without the exceptions for Norway."""
     zone = int((place.longitude + 180.0) // 6.0) % 60 + 1
     return f"epsg:{(32600 if place.latitude >= 0.0 else 32700) + zone}"

@@ -29,9 +29,9 @@ from crossgrad_plugins.groupings.split import (
 
 
 class Altitude(Grouping):
-    """near: cameras up to a height; far: cameras above it.
+    """near: cameras up to a given height; far: cameras above it.
 
-    Source: the paper, altitude thresholds; the choice of the axis and of the threshold was made for
+    Source: the paper, altitude thresholds; the axis and the threshold rule were chosen for
     crossgrad.
     """
 

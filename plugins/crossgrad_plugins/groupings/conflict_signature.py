@@ -29,19 +29,20 @@ from crossgrad_plugins.groupings.split import (
     smaller_mean_first,
 )
 
-#: Eigenvalues of a cosine matrix that are closer than this are equal up to rounding.
+#: Differences between eigenvalues of a cosine matrix below this value count as rounding errors.
 _SMALLEST_GAP = 1e-9
 
 
 class ConflictSignature(Regrouping):
-    """Two groups of cameras from a spectral cut of the cosines between their gradients.
+    """Two groups of cameras, from a spectral cut of the cosines between their gradients.
 
-    Gradients are normalised per block, and their cosines are averaged over blocks. The similarity
-    is (1 + cosine) / 2. The group with the smaller mean radial distance is near. A view that was
-    not probed has the label of the nearest probed camera. Until step `at`, when gradients become
-    available, the views are grouped as by `radial`.
+    The cosine of two gradients is computed per parameter block and averaged over the blocks. The
+    similarity of two cameras is (1 + cosine) / 2. The group with the smaller mean radial distance
+    is near. A view without a measured gradient gets the label of the nearest camera with a measured
+    gradient. Before step `at`, the views are grouped as by `radial`, because no gradients are
+    available.
 
-    Source: the paper names this grouping without a definition; the definition was made for
+    Source: the paper, which names this grouping without a definition; the definition was made for
     crossgrad.
     """
 
@@ -95,16 +96,16 @@ class ConflictSignature(Regrouping):
         try:
             return self.fit(model.scene, rng, ModelProbe(model, rng))
         except UserError as error:
-            # If all gradients agree, they form one group, and the run keeps its present groups.
+            # If all gradients agree, the run keeps its present groups.
             early = Radial().fit(model.scene, rng)
             return GroupingRule(early.labels, (f"the groups do not change: {error.what}",))
 
 
 def mean_cosines(gramians: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return [V, V] cosines averaged over the blocks of the Gramians [B, V, V].
+    """Return [V, V] cosines, averaged over the blocks of the Gramians [B, V, V].
 
-    A pair with a zero gradient has no cosine in that block. A pair without any cosine gets cosine
-    0.
+    If a gradient of a pair is zero in a block, the pair has no cosine in this block. A pair without
+    a cosine in any block gets cosine 0.
     """
     norms = np.sqrt(np.einsum("bii->bi", gramians))
     products = norms[:, :, None] * norms[:, None, :]
@@ -114,23 +115,24 @@ def mean_cosines(gramians: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def spectral_cut(cosines: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return [V] side 0 or 1, by the sign of the second eigenvector of the normalised Laplacian.
+    """Return [V] side 0 or 1: the sign of the normalised Laplacian's second eigenvector.
 
-    All cameras are on side 0 if there is no second direction, as with one camera or identical
-    cameras.
+    All cameras are on side 0 if there is no second eigenvector, for example with one camera or
+    identical cameras.
 
     Source: Shi and Malik 2000, with similarity (1 + cosine) / 2.
     """
     similarity = (1.0 + cosines) / 2.0
     root = np.sqrt(similarity.sum(axis=1))
-    # The second smallest eigenvalue of I - S is the second largest of S. The largest eigenvalue of
-    # S is 1, with a known eigenvector. If two groups have no similarity, the eigenvalue 1 occurs
-    # twice. The known eigenvector is therefore removed to find the other eigenvector.
+    # The second smallest eigenvalue of I - S is one minus the second largest eigenvalue of S. The
+    # largest eigenvalue of S is 1, and its eigenvector is known. If two groups have no similarity,
+    # S has the eigenvalue 1 twice. The known eigenvector is therefore removed from S before the
+    # other eigenvector is computed.
     scaled = similarity / root[:, None] / root[None, :]
     first = root / np.linalg.norm(root)
     values, vectors = np.linalg.eigh((scaled + scaled.T) / 2.0 - 2.0 * np.outer(first, first))
-    # The known eigenvalue is now -1, and no other eigenvalue is smaller. For two identical cameras
-    # the other eigenvalue is 0.
+    # After the removal, the known eigenvector has eigenvalue -1, and no other eigenvalue is
+    # smaller. For two identical cameras, the other eigenvalue is 0.
     if len(values) == 1 or min(values[-1], values[-1] - values[-2]) <= _SMALLEST_GAP:
         return np.zeros(len(values), dtype=np.int64)
     return (vectors[:, -1] > 0.0).astype(np.int64)

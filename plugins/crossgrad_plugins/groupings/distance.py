@@ -33,7 +33,7 @@ from crossgrad_plugins.groupings.split import (
 
 
 class Radial(Grouping):
-    """near: distance from the mean training camera up to its median; far: larger distances.
+    """near: cameras up to the median distance from the mean training camera; far: all others.
 
     Source: the paper, median radial split; Otsu's threshold was added for crossgrad.
     """
@@ -52,10 +52,11 @@ class Radial(Grouping):
 
 
 class Percentile(Grouping):
-    """near: cameras up to the q-th percentile of the distance from the mean camera; else far.
+    """near: cameras up to the q-th percentile of the distance from the mean camera.
 
-    Balanced pairs then estimate (near mean + far mean) / 2 instead of the mean over cameras. If q
-    is not 50, the estimate belongs to a different objective, and not only its variance differs.
+    All other cameras are far. Balanced pairs then estimate (near mean + far mean) / 2 instead of
+    the mean over all cameras. If q is not 50, these two means differ, so the run trains another
+    objective.
 
     Source: the paper, partition threshold study (30 and 70).
     """
@@ -76,7 +77,7 @@ class Percentile(Grouping):
 
 
 class Terciles(Grouping):
-    """near, middle and far: thirds of the distance from the mean training camera.
+    """near, middle and far: thirds of the cameras by distance from the mean training camera.
 
     Source: the paper, 3-way groups.
     """
@@ -97,7 +98,7 @@ class Terciles(Grouping):
 class Anchors(Grouping):
     """near: the nearest 30 % of the training cameras; far: the farthest 30 %; middle: all others.
 
-    The group middle may be empty in a scene with very few cameras; near and far may not be empty.
+    In a scene with very few cameras, middle may be empty; near and far may not be empty.
 
     Source: the paper, operator variants.
     """
@@ -122,12 +123,15 @@ class Anchors(Grouping):
 def rule_by_shares(
     scene: Scene, grouping: str, share: float, needed: Sequence[str]
 ) -> GroupingRule:
-    """Return the rule: near up to quantile `share` of the radial distance, far above 1 - share.
+    """Return the rule that puts equal shares of the cameras into near and far.
+
+    near ends at the quantile `share` of the radial distance, and far starts at the quantile 1 -
+    share.
 
     Args:
         scene: The scene.
         grouping: Name of the grouping, for messages.
-        share: Share of the near and share of the far training cameras, at most 1/2.
+        share: Share of the training cameras in near, and also in far; at most 1/2.
         needed: Labels that need training views.
 
     Raises:

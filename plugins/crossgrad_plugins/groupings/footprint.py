@@ -1,4 +1,4 @@
-"""Groups of cameras by how large the scene appears, in pixels per local unit."""
+"""Groups of cameras by the size of the scene in the image, in pixels per local unit."""
 
 from collections.abc import Sequence
 
@@ -31,12 +31,13 @@ from crossgrad_plugins.groupings.split import (
 
 
 class Footprint(Grouping):
-    """near: views that show a local unit with at least the median number of pixels; else far.
+    """near: views that show a local unit with at least the median number of pixels.
 
-    The measure of a view is the median of f/z over the SfM points that the view observed. If the
-    view observed fewer than three points, all SfM points in its image are used. If there are no
-    points in the image either, the view gets the measure of the nearest training camera with a
-    measure. The measure includes the focal length and does not assume cameras around a centre.
+    All other views are far. The footprint of a view is the median of f/z over the SfM points that
+    the view observed; f is the focal length and z is the depth. If the view observed fewer than
+    three points, all SfM points inside its image are used. If the image contains no points either,
+    the view gets the footprint of the nearest training camera that has one. The footprint depends
+    on the focal length, and does not assume that the cameras surround a centre.
 
     Source: the paper, projected footprint; Otsu's threshold and the fallbacks were added for
     crossgrad.
@@ -61,7 +62,7 @@ class Footprint(Grouping):
         known_footprints, places = footprints[~blind], scene.centers[~blind]
 
         def sizes(views: Sequence[View]) -> NDArray[np.float64]:
-            """Return [V] negative footprints; small values are near, as `halves` requires."""
+            """Return [V] negative footprints, because `halves` assigns small values to near."""
             return -_filled(_own(scene, views), views, known_footprints, places)
 
         train = sizes(scene.train_views)
@@ -91,7 +92,10 @@ def _filled(
     known_footprints: NDArray[np.float64],
     places: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return [V] footprints; NaN becomes the value of the nearest camera at `places` [N, 3]."""
+    """Return [V] footprints.
+
+    NaN becomes the value of the nearest camera, with centres `places` [N, 3].
+    """
     for row, view in enumerate(views):
         if np.isnan(footprints[row]):
             ways = np.linalg.norm(places - centers_of((view,)), axis=1)

@@ -28,12 +28,13 @@ _TOLERANCE = 1e-10
 
 
 class GaussianMixture(Grouping):
-    """The two components of a mixture fitted to log r; near is the component with the smaller mean.
+    """Fits a mixture of two components to log-distances.
 
-    If the fit is degenerate, the median is used (grouping `radial`), with a note. A fit is
-    degenerate if a component weighs less than one camera, if it gets no camera, or if a number is
-    not finite. A camera at the mean of all cameras has no log-distance. This camera is near, and is
-    left out of the fit.
+    The component with the smaller mean is near. If the fit is degenerate, the median is used as in
+    grouping `radial`, and the log contains a note. A fit is degenerate if a component weighs less
+    than one camera, if a component gets no camera, or if a number is not finite. A camera at the
+    mean of all cameras has distance 0 and therefore no log-distance. This camera is near and is not
+    used in the fit.
 
     Source: expectation maximisation (Dempster et al. 1977) in one dimension.
     """
@@ -65,7 +66,7 @@ class GaussianMixture(Grouping):
 
 @dataclass(frozen=True, eq=False)
 class _Mixture:
-    """Weights, means (ascending) and variances, [2] each, and the log-likelihood of the fit."""
+    """Weights, means (ascending) and variances, [2] each, and the fit's log-likelihood."""
 
     weights: NDArray[np.float64]
     means: NDArray[np.float64]
@@ -80,7 +81,7 @@ class _Mixture:
 
 
 def _fit(logs: NDArray[np.float64], restarts: int, rng: np.random.Generator) -> _Mixture | None:
-    """Return the most likely of several fits, or None if no fit is usable."""
+    """Return the most likely of several fits, or None if all fits are degenerate."""
     if len(logs) < _FEWEST or (spread := float(logs.var())) == 0.0:
         return None
     fits = [_expectation_maximisation(logs, spread, rng) for _ in range(restarts)]
@@ -96,7 +97,7 @@ def _usable(mixture: _Mixture, cameras: int) -> bool:
 def _expectation_maximisation(
     logs: NDArray[np.float64], spread: float, rng: np.random.Generator
 ) -> _Mixture:
-    """Return one fit that starts with two random cameras as means."""
+    """Return one fit; the means start at the log-distances of two random cameras."""
     starts = np.sort(rng.choice(logs, size=2, replace=False))
     mixture = _Mixture(np.full(2, 0.5), starts, np.full(2, spread), -np.inf)
     for _ in range(_ITERATIONS):
@@ -122,9 +123,9 @@ def _maximised(
     variance_floor: float,
     likelihood: float,
 ) -> _Mixture:
-    """Return the mixture with the weighted moments of the cameras; shares [N, 2] are weights."""
-    # A component without any camera keeps finite values. `_usable` rejects the component because of
-    # its weight.
+    """Return the mixture of the cameras' weighted moments; `shares` [N, 2] are the weights."""
+    # A component without any camera needs finite values. `_usable` rejects such a component because
+    # of its weight.
     totals = np.maximum(shares.sum(axis=0), np.finfo(np.float64).tiny)
     means = (shares * logs[:, None]).sum(axis=0) / totals
     squares = (shares * (logs[:, None] - means) ** 2).sum(axis=0) / totals
@@ -133,7 +134,7 @@ def _maximised(
 
 
 def _log_joint(logs: NDArray[np.float64], mixture: _Mixture) -> NDArray[np.float64]:
-    """Return [V, 2] log of weight times density."""
+    """Return [V, 2] logarithm of each component's weight times density."""
     squared = (logs[:, None] - mixture.means) ** 2 / mixture.variances
     constant = np.log(mixture.weights) - 0.5 * np.log(2.0 * np.pi * mixture.variances)
     return np.asarray(constant - 0.5 * squared)

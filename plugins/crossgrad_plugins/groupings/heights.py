@@ -8,30 +8,32 @@ from numpy.typing import NDArray
 
 from crossgrad_core.plugin import Scene, UserError, View, centers_of, without_rounding
 
-#: An axis, or the method to find it.
+#: An axis, or the name of a method to find the axis.
 Up: TypeAlias = Literal["auto", "cameras", "pca"] | tuple[float, float, float]
 
-#: If the mean of the cameras' unit up axes is shorter than this, the axes point in all directions
-#: and the mean is not usable.
+#: If the mean of the cameras' unit up axes is shorter than this, the axes point in all directions,
+#: and the mean is not used.
 _SHORTEST_MEAN = 0.1
 
 
 def altitudes(scene: Scene, views: Sequence[View], up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return [V] height of each camera over the mean training camera, along the unit axis `up` [3].
+    """Return [V] the height of each camera above the mean training camera, along `up` [3].
 
-    Rounding differences between equal heights are removed, as in `radial_distances`.
+    Rounding differences between equal heights are removed, as `radial_distances` does for
+    distances.
     """
     # Do not use a matrix product, because its rounding depends on the number of rows. A median
-    # threshold is exactly equal to one of the heights, so the rounding matters.
+    # threshold equals one of the heights, so a rounding error could move a camera to the other
+    # group.
     return without_rounding(scene, ((centers_of(views) - scene.middle) * up).sum(axis=1))
 
 
 def upward(scene: Scene, up: Up = "auto") -> tuple[NDArray[np.float64], str]:
     """Return the scene's unit upward axis [3] in the local frame, and a text about its origin.
 
-    `cameras` is the mean of the training cameras' up axes (-y of OpenCV cameras). `pca` is the axis
-    of least variance of their centres. `auto` uses `cameras`, unless the up axes cancel (cameras
-    that look straight down in all headings).
+    Method `cameras` uses the mean of the training cameras' up axes (-y of OpenCV cameras). Method
+    `pca` uses the axis along which the camera centres vary least. Method `auto` uses `cameras`,
+    unless the up axes cancel, as for cameras that look straight down in all headings.
 
     Raises:
         UserError: The given axis has no direction, or the cameras' up axes cancel.
@@ -68,10 +70,10 @@ def _given(up: tuple[float, float, float]) -> NDArray[np.float64]:
 
 
 def _flattest(scene: Scene) -> NDArray[np.float64]:
-    """Return the axis of least variance of the training cameras' centres.
+    """Return the axis along which the training cameras' centres vary least.
 
-    The axis points so that the cameras are above the SfM points. Without SfM points, the axis
-    points so that the cameras look down.
+    The sign is chosen so that the cameras are above the SfM points. Without SfM points, the sign is
+    chosen so that the cameras look down.
     """
     spread = scene.robust_centers - scene.middle
     axis = np.linalg.eigh(spread.T @ spread)[1][:, 0]

@@ -28,7 +28,9 @@ _ITERATIONS = 200
 
 
 class KMeans(Grouping):
-    """The two k-means clusters of the camera centres; near has the smaller mean radial distance.
+    """Two k-means clusters of the camera centres.
+
+    The cluster with the smaller mean radial distance is near.
 
     Source: Lloyd's algorithm with k-means++ seeding (Arthur and Vassilvitskii 2007).
     """
@@ -67,7 +69,7 @@ def _nearest(points: NDArray[np.float64], centroids: NDArray[np.float64]) -> NDA
 
 
 def _seeds(points: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
-    """Return [2, 3] two of the points.
+    """Return two points [2, 3] as the first centroids.
 
     The probability of the second point is proportional to its squared distance from the first.
     """
@@ -81,7 +83,7 @@ def _seeds(points: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.
 def _lloyd(
     points: NDArray[np.float64], centroids: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], float]:
-    """Return the centroids after convergence, and the sum of squared distances from them."""
+    """Return the centroids after convergence, and the sum of squared distances to them."""
     for _ in range(_ITERATIONS):
         clusters = _nearest(points, centroids)
         if len(np.unique(clusters)) < len(centroids):

@@ -21,7 +21,7 @@ from crossgrad_plugins.groupings.split import require_training_views
 
 
 class Lists(Grouping):
-    """Labels by the images' top folder, or from a file of the user.
+    """Labels from the images' top folder, or from a file of the user.
 
     Without a file, the label of `aerial/0001.jpg` is `aerial`. A file is CSV with two columns, view
     name and label. A name that ends with a slash is a folder, and its label applies to all views in

@@ -1,4 +1,4 @@
-"""Labels from a threshold, the threshold itself, and a check that every group has views."""
+"""Labels from a threshold, the choice of the threshold, and a check that every group has views."""
 
 from collections.abc import Callable, Sequence
 from typing import Final, Literal, TypeAlias
@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from crossgrad_core.plugin import GroupingRule, Quantity, Scene, UserError, View, radial_distances
 
-#: The threshold between near and far: the median distance, or Otsu's threshold of its logarithm.
+#: How the threshold between near and far is found: the median distance, or Otsu's threshold of the
+#: log-distances.
 Cut: TypeAlias = Literal["median", "otsu"]
 CUT: Final = "threshold between near and far: the median, or Otsu's threshold of the logarithms"
 NEAR, MIDDLE, FAR = "near", "middle", "far"
@@ -22,7 +23,9 @@ def halves(values: NDArray[np.float64], threshold: float) -> tuple[str, ...]:
 def rule_of_distances(
     scene: Scene, grouping: str, threshold_of: Callable[[NDArray[np.float64]], float | np.floating]
 ) -> GroupingRule:
-    """Return the rule: `near` up to a threshold of the distance from the mean training camera.
+    """Return the rule that labels cameras up to a threshold distance `near`.
+
+    Distances are measured from the mean training camera.
 
     Args:
         scene: The scene.
@@ -42,7 +45,10 @@ def rule_of_distances(
 
 
 def cut_of(distances: NDArray[np.float64], cut: Cut) -> float:
-    """Return the threshold of distances [V >= 1]; distances of 0 do not affect Otsu's threshold."""
+    """Return the threshold of distances [V >= 1].
+
+    Distances of 0 do not affect Otsu's threshold.
+    """
     if cut == "median" or not (distances > 0.0).any():
         return float(np.median(distances))
     return float(np.exp(otsu_threshold(np.log(distances[distances > 0.0]))))
@@ -98,10 +104,10 @@ def require_groups(
 
 
 def smaller_mean_first(sides: NDArray[np.int64], distances: NDArray[np.float64]) -> int:
-    """Return the side, 0 or 1, with the smaller mean distance; 0 if one side is empty.
+    """Return the side, 0 or 1, with the smaller mean distance; 0 if a side is empty.
 
     Args:
-        sides: [V] side of each view.
+        sides: [V] side of each view: 0 or 1.
         distances: [V] distance of each view.
     """
     means = [float(distances[sides == side].mean()) for side in (0, 1) if (sides == side).any()]
@@ -109,10 +115,10 @@ def smaller_mean_first(sides: NDArray[np.int64], distances: NDArray[np.float64])
 
 
 def otsu_threshold(values: NDArray[np.float64]) -> float:
-    """Return the threshold between values [N >= 1] with the least variance within both sides.
+    """Return the threshold of values [N >= 1] with the least variance within its two sides.
 
-    The result is exact: every threshold between two different sorted values is tried, without a
-    histogram. If all values are equal, the result is that value.
+    The result is exact, because every threshold between two different sorted values is tried. If
+    all values are equal, the result is this value.
 
     Source: Otsu 1979 (largest variance between classes).
     """
@@ -121,10 +127,10 @@ def otsu_threshold(values: NDArray[np.float64]) -> float:
 
 
 def otsu_separability(samples: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return [...] share of the variance of values [..., N >= 2] between the two sides.
+    """Return [...] the share of the variance that is between two sides of values [..., N >= 2].
 
-    The sides are separated by Otsu's threshold. The share is 1 for two values, and 3/4 for very
-    many evenly spread values. The share is 0 if all values are equal.
+    Otsu's threshold separates the two sides. The share is 1 for two different values, and about 3/4
+    for many evenly spread values. The share is 0 if all values are equal.
 
     Source: Otsu 1979 (eta, equation 14).
     """
@@ -137,9 +143,9 @@ def otsu_separability(samples: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _between(ordered: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return [..., N-1] N^2 times the variance between the sides of each cut.
+    """Return [..., N-1] the variance between the two sides of each cut, times N^2.
 
-    Values [..., N] are sorted. The result is -1 for a cut between equal values.
+    The values [..., N] must be sorted. The result is -1 for a cut between equal values.
     """
     sums, total = np.cumsum(ordered, axis=-1)[..., :-1], ordered.sum(axis=-1, keepdims=True)
     left = np.arange(1, ordered.shape[-1])
@@ -155,9 +161,9 @@ def gap_threshold(values: NDArray[np.float64]) -> float:
 
 
 def _cut(ordered: NDArray[np.float64], scores: NDArray[np.float64]) -> float:
-    """Return the middle of the gap with the best score [N-1] between sorted values [N].
+    """Return the middle of the gap [N-1] with the best score, between sorted values [N].
 
-    If no score is above 0, the result is the maximum value.
+    If no score is above 0, the largest value is returned.
     """
     if len(scores) == 0 or scores.max() <= 0.0:
         return float(ordered[-1])

@@ -1,1 +1,1 @@
-"""Built-in starts."""
+"""Built-in initializers."""

@@ -1,4 +1,4 @@
-"""The depth of a photo between its SfM points: a plane, adjusted to the nearest points."""
+"""The depth of a photo between its SfM points: a plane, corrected by the nearest points."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,30 +12,33 @@ from crossgrad_core.plugin import Camera
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-#: Number of neighbours whose distance from the plane is used.
+#: Number of neighbouring points that correct the depth of the plane at a pixel.
 _NEIGHBOURS = 8
-#: Distances in units of the photo's longer side. All distances below the first value have the same
-#: weight. At the second value, a point has the same weight as the plane.
+#: Distances between pixels, in units of the photo's longer side. All distances below `_BLUR` have
+#: the same weight. A point at distance `_REACH` has the same weight as the plane.
 _BLUR, _REACH = 0.02, 0.1
-#: The largest depth of a photo, as a multiple of the depth of its farthest points.
+#: The largest depth in a photo, as a multiple of the depth of its farthest points.
 _FARTHEST = 2.0
 #: Distance of the sky, as a multiple of the distance of the farthest camera or point.
 _SKY = 2.0
-#: This share of the points may be nearer than all added points. The same share may be farther.
+#: Share of the observed points that are nearer than the smallest depth of an added point. An equal
+#: share of the points is left out at the far end, because single points are often wrong.
 _TAIL = 0.02
-#: Huber's constant, with which the fit has 95 % of the efficiency of least squares.
+#: Huber's constant, which gives the fit 95 % of the efficiency of least squares for normal noise,
+#: and the number of reweighting passes.
 _HUBER, _PASSES = 1.345, 10
 
 
 @dataclass(frozen=True, eq=False)
 class Sky:
-    """The position of the sky of a scene.
+    """The distance of the sky in a scene.
 
     Attributes:
         up: [3] the scene's upward axis, unit, local frame.
         centers: [V, 3] centres of the cameras.
         points: [P, 3] SfM points, or a sample of them.
-        most: Share of the points that are not outliers.
+        most: Quantile of the distances of the points that counts as their largest distance; the
+            farther points are outliers.
     """
 
     up: NDArray[np.float64]
@@ -44,7 +47,10 @@ class Sky:
     most: float
 
     def depth(self, camera: Camera) -> float:
-        """Return the distance of the sky, which is behind all points that the camera could see."""
+        """Return the depth of the sky for a camera.
+
+        The depth is a multiple of the distance to the farthest camera or point.
+        """
         center = camera.center.numpy()
         far = float(np.linalg.norm(self.centers - center, axis=1).max())
         if len(self.points):
@@ -55,7 +61,8 @@ class Sky:
     def rise(self, camera: Camera) -> NDArray[np.float64]:
         """Return [3] the slope of the rays through pixels, as a linear function of (x, y, 1).
 
-        x and y are as in `from_the_middle`. The function is positive for rays that go up.
+        x and y are pixel coordinates as returned by `from_the_middle`. The function is positive for
+        rays that go up.
         """
         across, down, ahead = camera.world_to_camera[:3, :3].numpy() @ self.up
         side = max(camera.width, camera.height)
@@ -68,9 +75,9 @@ class Sky:
 class Depth:
     """Depth of a photo, estimated from the points that it observed.
 
-    The inverse depth of a plane in space is a plane over the pixels. The ground therefore continues
-    beyond its last point, up to the horizon. Rays that go up and do not meet the plane end in the
-    sky.
+    If the scene is a plane, its inverse depth is a linear function of the pixel. A plane is
+    therefore fitted to the inverse depths, and the ground continues up to the horizon. Rays that go
+    up and do not meet the plane end at the depth of the sky.
 
     Attributes:
         pixels: [S, 2] pixels of the points, in units of the longer side from the photo's centre.
@@ -78,7 +85,7 @@ class Depth:
         median: Median depth of the points.
         nearest: Largest inverse depth of an added point.
         farthest: Smallest inverse depth of an added point that is not sky.
-        rise: [3] slope of the rays, as a linear function of (x, y, 1).
+        rise: [3] slope of the rays, as coefficients of a linear function of (x, y, 1).
         sky: Depth of the sky.
     """
 
@@ -94,7 +101,7 @@ class Depth:
     def of(
         cls, camera: Camera, points: NDArray[np.float64], fewest: int, sky: Sky
     ) -> "Depth | None":
-        """Return the depth of a photo, or None if fewer than `fewest` points are in front of it.
+        """Return the depth of a photo, or None if fewer than `fewest` points are in front.
 
         Args:
             camera: The photo's camera.
@@ -114,12 +121,12 @@ class Depth:
 
     @cached_property
     def plane(self) -> NDArray[np.float64]:
-        """[3] inverse depth of the plane, as a linear function of (x, y, 1)."""
+        """[3] inverse depth of the plane, as coefficients of a linear function of (x, y, 1)."""
         return _plane(self.pixels, self.inverse)
 
     @cached_property
     def rest(self) -> NDArray[np.float64]:
-        """[S] inverse depths of the points minus the inverse depth of the plane."""
+        """[S] residuals: inverse depths of the points minus the inverse depth of the plane."""
         return self.inverse - _on(self.plane, self.pixels)
 
     @cached_property
@@ -129,11 +136,14 @@ class Depth:
         return cKDTree(self.pixels)
 
     def rises(self, around: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return [N], True if the ray through a pixel [N, 2], as in `from_the_middle`, goes up."""
+        """Return [N], True if the ray through a pixel goes up.
+
+        Pixels [N, 2] are as in `from_the_middle`.
+        """
         return _on(self.rise, around) > 0.0
 
     def at(self, around: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return [N] depths at pixels [N, 2], in units of the longer side from the centre."""
+        """Return [N] depths at pixels [N, 2], which are given as in `from_the_middle`."""
         count = min(_NEIGHBOURS, len(self.rest))
         distances, rows = self._tree.query(around, k=[*range(1, count + 1)])
         weights = 1.0 / (distances**2 + _BLUR**2)
@@ -144,7 +154,7 @@ class Depth:
 
 
 def from_the_middle(camera: Camera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return pixels [N, 2] in units of the photo's longer side, from its centre."""
+    """Return pixels [N, 2] relative to the photo's centre, divided by the photo's longer side."""
     middle = np.array([camera.width, camera.height]) / 2.0
     return (pixels - middle) / max(camera.width, camera.height)
 
@@ -154,14 +164,14 @@ def _on(plane: NDArray[np.float64], around: NDArray[np.float64]) -> NDArray[np.f
 
 
 def _plane(around: NDArray[np.float64], inverse: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return [3] the plane fitted with Huber's loss, by iterative reweighting."""
+    """Return [3] coefficients of the plane, fitted with Huber's loss by iterative reweighting."""
     columns = np.column_stack([around, np.ones(len(around))])
     weights = np.ones(len(around))
     for _ in range(_PASSES):
         root = np.sqrt(weights)
         plane = np.linalg.lstsq(columns * root[:, None], inverse * root, rcond=None)[0]
         off = np.abs(inverse - columns @ plane)
-        # For normal noise, the median absolute deviation is 0.6745 sigma.
+        # For normal noise, the median absolute deviation is 0.6745 times the standard deviation.
         limit = _HUBER * np.median(off) / 0.6745
         weights = np.minimum(1.0, np.divide(limit, off, out=np.ones_like(off), where=off > limit))
     return np.asarray(plane)

@@ -1,4 +1,4 @@
-"""Large Gaussians in parts of photos without SfM points, and beyond the edges of photos."""
+"""Additional Gaussians in parts of photos without SfM points, and beyond the edges of photos."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,32 +14,33 @@ from crossgrad_plugins.groupings.heights import upward
 from crossgrad_plugins.initializers.cells import Cells
 from crossgrad_plugins.initializers.depth import Depth, Sky, from_the_middle
 
-#: Number of observed points that a photo needs for an estimate of its depth.
+#: Minimum number of observed points for an estimate of a photo's depth.
 FEWEST: Final = 8
-#: Standard deviation of an added Gaussian, as a share of the side of its cell.
+#: Standard deviation of an added Gaussian, as a share of the side length of its cell.
 _SIZE: Final = 0.8
 _NEAREST: Final = 3
-#: A point is hidden in a photo if it is farther away than this multiple of the photo's depth at
-#: that position.
+#: A point is hidden in a photo if its depth is larger than this multiple of the photo's depth at
+#: its pixel.
 _BEHIND: Final = 1.5
-#: A camera is above the ground of a photo if its distance is at least this share of the photo's
-#: depth at that position, and if the ray down to it is at least this steep (sine).
+#: A photo shows the ground below a camera if two conditions hold. The camera's depth in the photo
+#: is at least `_GROUND` times the photo's depth at that pixel. The ray to the camera goes down with
+#: a sine of at least `_STEEP`.
 _GROUND, _STEEP = 0.75, 0.3
-#: Number of points from which the extent of the scene is computed, and share of the points that are
+#: Number of points from which the extent of the scene is computed, and the share of them that are
 #: not outliers.
 _POINTS, _NOT_STRAY = 1000, 0.98
 
 
 @dataclass(eq=False)
 class _Filling:
-    """The points so far.
+    """The points of the scene and the points added so far.
 
     Attributes:
-        points: [P, 3] points of the scene and added points.
-        sizes: [P] standard deviation of the area that each point covers, local units.
-        colors: Colours of the added points, view by view.
-        inside: Number of points that were added on photos.
-        left_aside: Number of photos with too few points.
+        points: [P, 3] positions of the scene's points and of the added points.
+        sizes: [P] standard deviation of the Gaussian at each point, local units.
+        colors: Colours of the added points, one array per call of `add`.
+        inside: Number of points that were added inside photos.
+        left_aside: Number of photos that were skipped because they observed too few points.
     """
 
     points: NDArray[np.float64]
@@ -59,17 +60,18 @@ class _Filling:
         self.colors.append(colors)
 
 
-#: Cache of the results of each scene. The results are deleted together with the scene.
+#: Cache of the filled points of each scene and initializer. An entry is deleted together with its
+#: scene.
 _KNOWN: "WeakKeyDictionary[Scene, dict[Filled, _Filling]]" = WeakKeyDictionary()
 
 
 class Filled(Initializer):
-    """Fills cells of photos that have no points, and a margin beyond all photos.
+    """Adds Gaussians in cells of photos without points, and in a margin beyond the edges of photos.
 
-    The depth is a plane through the points that a photo observed, adjusted to the nearest points.
-    Cells beyond a photo's edge are filled if no training photo shows them. They get the colour at
-    the edge. Held-out photos and viewers then show continued ground there instead of black holes.
-    This method was developed for crossgrad.
+    The depth of a photo is a plane through the points that the photo observed, corrected by the
+    nearest points. A cell beyond a photo's edge is filled if no training photo shows it. The added
+    Gaussian gets the colour at the photo's edge. Held-out photos and viewers then show continued
+    ground instead of black holes. This method was developed for crossgrad.
     """
 
     cells: int = Field(12, ge=2, le=200, description="points along the longer side of a photo")
@@ -127,8 +129,8 @@ class Filled(Initializer):
         }
         with_depth = [(view, depth) for view in views if (depth := deep[view]) is not None]
         filling.left_aside = len(views) - len(with_depth)
-        # Fill near photos first, with small Gaussians, so that no large Gaussians are needed behind
-        # them.
+        # Fill near photos first, because their added Gaussians are small and cover cells of far
+        # photos too.
         with_depth.sort(key=lambda pair: pair[1].median)
         air = _Air.of(with_depth)
         for view, depth in with_depth:
@@ -136,8 +138,8 @@ class Filled(Initializer):
         filling.inside = len(filling.points) - len(scene.points)
         if margin and with_depth:
             pictures = _Pictures.of(deep)
-            # A camera may be just above ground that another photo shows. The depth of this other
-            # photo then decides whether it shows the surroundings of the camera or hides them.
+            # Leave out a camera if another photo shows the ground just below the camera. The depth
+            # of that photo then determines which surroundings of the camera are visible.
             centers = np.stack([view.camera.center.numpy() for view, _ in with_depth])
             low = pictures.look_down_on(centers, sky.up)
             high = [pair for pair, inside in zip(with_depth, low, strict=True) if not inside]
@@ -154,10 +156,11 @@ class Filled(Initializer):
         margin: int,
         seen: "_Pictures | None",
     ) -> None:
-        """Fill a photo or, with a margin, the cells beyond its edges that `seen` does not show.
+        """Fill empty cells of a photo, or cells beyond its edges that `seen` does not show.
 
-        Rays that go up could place points in the air. On the photo such points are moved to the
-        sky. Beyond the edges of the photo they are left out.
+        A point on a ray that goes up could float in the air near a camera. Inside the photo, a
+        floating point is moved to the sky. Beyond the edges of the photo, a floating point is left
+        out.
         """
         camera = view.camera
         cells = Cells(camera, max(camera.width, camera.height) / self.cells, margin)
@@ -182,14 +185,14 @@ class Filled(Initializer):
 
 
 def _spread(views: Sequence[View], most: int) -> list[View]:
-    """Return at most `most` of the views, evenly spread."""
+    """Return at most `most` views at even intervals."""
     if len(views) <= most:
         return list(views)
     return [views[row] for row in np.linspace(0, len(views) - 1, most).round().astype(int)]
 
 
 def _spacings(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return [P] distances of the points to their neighbours, like the initial sizes of 3DGS."""
+    """Return [P] root mean square distances of points to their neighbours, as in 3DGS."""
     from scipy.spatial import cKDTree
 
     count = min(_NEAREST, len(points) - 1)
@@ -202,7 +205,7 @@ def _spacings(points: NDArray[np.float64]) -> NDArray[np.float64]:
 def _behind(
     view: View, pixels: NDArray[np.float64], depths: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return [N, 3] points of the local frame at depths [N] along the rays of pixels [N, 2]."""
+    """Return [N, 3] points at depths [N] on the rays through pixels [N, 2], in the local frame."""
     camera, pose = view.camera, view.camera.world_to_camera.numpy()
     rays = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     local = np.column_stack([rays, np.ones(len(rays))]) * depths[:, None]
@@ -211,11 +214,11 @@ def _behind(
 
 @dataclass(frozen=True, eq=False)
 class _Air:
-    """The space around cameras that is nearer than everything they see.
+    """The empty space around cameras: a ball up to the nearest point that each camera sees.
 
     Attributes:
         centers: [K, 3] centres of the cameras.
-        reach: [K] depth of the nearest point that each camera sees.
+        reach: [K] radius of each ball: the depth of the nearest point that the camera sees.
     """
 
     centers: NDArray[np.float64]
@@ -228,9 +231,9 @@ class _Air:
         return cls(np.array(centers).reshape(-1, 3), np.array(reach))
 
     def holds(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return [N], True if a point [N, 3] is in this space.
+        """Return [N], True if a point [N, 3] is in one of the balls.
 
-        Points within the rounding error of the border are not in this space.
+        Points on the surface of a ball, up to rounding errors, do not count as inside.
         """
         held = np.zeros(len(points), dtype=np.bool_)
         for center, reach in zip(self.centers, self.reach, strict=True):
@@ -240,15 +243,16 @@ class _Air:
 
 @dataclass(frozen=True, eq=False)
 class _Pictures:
-    """The volumes of space that some views show, up to their depth.
+    """The volumes of space that views show, up to the depth of each view.
 
     Attributes:
         cameras: Cameras of the views.
-        depths: Depth of each view; None if it is unknown; the view then has no far limit.
-        matrices: [V, 3, 4] map from homogeneous points of the local frame to pixels times depth.
-        ends: [V, 1, 2] width and height.
-        limits: [V, 2] depth up to which a view shows everything, and depth beyond which it shows
-            nothing.
+        depths: Depth of each view; None if it is unknown, and then the view has no far limit.
+        matrices: [V, 3, 4] projections from homogeneous points of the local frame to pixels times
+            depth.
+        ends: [V, 1, 2] width and height of the image.
+        limits: [V, 2] depth up to which a view shows every point, and depth beyond which it shows
+            no point.
     """
 
     cameras: Sequence[Camera]
@@ -274,9 +278,10 @@ class _Pictures:
         )
 
     def show(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return [N], True if a view shows a point [N, 3].
+        """Return [N], True if at least one view shows a point [N, 3].
 
-        A point is shown if it is inside the image and not far behind the depth of the view.
+        A view shows a point inside its image if the point's depth is at most `_BEHIND` times the
+        view's depth at that pixel.
         """
         pixels, depth, inside = self._seen(points)
         shown = np.asarray((inside & (depth <= self.limits[:, :1])).any(axis=0))
@@ -291,11 +296,11 @@ class _Pictures:
     def look_down_on(
         self, points: NDArray[np.float64], up: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
-        """Return [N], True if a view shows, from above, the ground below a point.
+        """Return [N], True if a view from above shows the ground just below a point.
 
         Args:
-            points: [N, 3].
-            up: [3] the upward axis.
+            points: [N, 3] positions, local frame.
+            up: [3] the scene's upward axis.
         """
         pixels, depth, inside = self._seen(points)
         low = np.zeros(len(points), dtype=np.bool_)
@@ -312,16 +317,17 @@ class _Pictures:
     def _seen(
         self, points: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Return [V, N, 2] pixels times depth, [V, N] depths, and if points are in the images."""
+        """Return [V, N, 2] pixels times depth, [V, N] depths, and [V, N] True if in the image."""
         homogeneous = np.column_stack([points, np.ones(len(points))])
         around = np.einsum("vij,nj->vni", self.matrices, homogeneous)
         pixels, depth = around[..., :2], around[..., 2]
-        # Multiply both sides by the depth, so that no division by zero can occur.
+        # Compare pixels times depth instead of pixels, so that no division by a depth of zero
+        # occurs.
         inside = ((pixels >= 0.0) & (pixels <= self.ends * depth[..., None])).all(axis=2)
         return pixels, depth, np.asarray(inside & (depth > 0.0))
 
     def _at(self, view: int, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return [N] depths of a view with known depth, at pixels [N, 2]."""
+        """Return [N] depths at pixels [N, 2] of a view whose depth is known."""
         deep = self.depths[view]
         assert deep is not None
         return deep.at(from_the_middle(self.cameras[view], pixels))

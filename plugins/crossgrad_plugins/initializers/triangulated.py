@@ -1,4 +1,4 @@
-"""Points for scenes without points: features of photos are matched and triangulated."""
+"""Points for scenes without SfM points: features of photos are matched and triangulated."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,14 +25,16 @@ from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
 #: Cosine of the largest angle between the axes of two cameras whose photos are matched.
 _ASKEW: Final = 0.5
 _FEWEST: Final = 3
-_GREY: Final = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601
-#: Cache of the results of each scene. The results are deleted together with the scene.
+# Weights of red, green and blue for grey images (ITU-R BT.601).
+_GREY: Final = np.array([0.299, 0.587, 0.114])
+#: Cache of the triangulated points of each scene and initializer. An entry is deleted together with
+#: its scene.
 _KNOWN: "WeakKeyDictionary[Scene, dict[Triangulated, MorePoints]]" = WeakKeyDictionary()
-#: Lowe's ratio of the distance to the nearest descriptor to the distance to the second nearest
-#: (SIFT, section 7.1).
+#: Lowe's ratio: the distance to the nearest descriptor divided by the distance to the second
+#: nearest (SIFT, section 7.1).
 _RATIO: Final = 0.8
-#: Smallest and largest angle between two rays. At smaller angles the intersection is inaccurate. At
-#: larger angles, the features show different surfaces.
+#: Smallest and largest angle between the two rays of a match. At smaller angles, the intersection
+#: of the rays is inaccurate. At larger angles, the two features usually show different surfaces.
 _SMALLEST, _LARGEST = np.deg2rad(1.5), np.deg2rad(60.0)
 
 
@@ -42,8 +44,8 @@ class Features:
 
     Attributes:
         camera: The photo's camera.
-        pixels: [F, 2] positions, pixel centres at +0.5.
-        descriptors: [F, D] float32, of length 1.
+        pixels: [F, 2] positions; the centre of a pixel is at +0.5.
+        descriptors: [F, D] float32 descriptors of length 1.
         colors: [F, 3] uint8 colours of the photo at the features.
     """
 
@@ -58,10 +60,10 @@ class Met:
     """Matched features of two photos and their triangulated points.
 
     Attributes:
-        first: [M] rows of the features of the first photo.
-        second: [M] rows of the features of the second photo.
+        first: [M] indices of the features of the first photo.
+        second: [M] indices of the features of the second photo.
         points: [M, 3] triangulated points, local frame.
-        angles: [M] angles between the rays, radians.
+        angles: [M] angles between the two rays at each point, radians.
     """
 
     first: NDArray[np.int64]
@@ -71,9 +73,10 @@ class Met:
 
 
 class Triangulated(Initializer):
-    """Triangulates SIFT features of neighbouring training photos, if a scene has no points.
+    """Triangulates SIFT features of neighbouring training photos if a scene has no points.
 
-    Poses are not changed. This initializer adds no points to a scene that has points.
+    The poses of the cameras are not changed. This initializer adds no points to a scene that has
+    points.
     """
 
     alone: ClassVar[bool] = True
@@ -131,7 +134,7 @@ class Triangulated(Initializer):
         return meet(first, second, self.pixels)
 
     def _features(self, view: View) -> Features:
-        """Return the SIFT features of a photo at pixels that count."""
+        """Return the SIFT features of a photo at unmasked pixels."""
         photo = view.photo
         image, mask = photo.image().cpu().numpy(), photo.mask()
         grey = np.ascontiguousarray((image @ _GREY).round().astype(np.uint8))
@@ -147,7 +150,7 @@ class Triangulated(Initializer):
 
 
 def _sift(grey: NDArray[np.uint8], most: int) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Return [F, 2] pixels and [F, 128] descriptors, of length 512, of a photo [H, W]."""
+    """Return pixels [F, 2] and descriptors [F, 128] of length 512 for a grey photo [H, W]."""
     guard_pycolmap()
     import pycolmap
 
@@ -165,23 +168,23 @@ def _sift(grey: NDArray[np.uint8], most: int) -> tuple[NDArray[np.float64], NDAr
 
 
 def _spread(views: Sequence[View], most: int) -> list[View]:
-    """Return at most `most` of the views, evenly spread."""
+    """Return at most `most` views at even intervals."""
     if len(views) <= most:
         return list(views)
     return [views[row] for row in np.linspace(0, len(views) - 1, most).round().astype(int)]
 
 
 def _pairs(views: Sequence[View], neighbours: int) -> list[tuple[int, int]]:
-    """Return pairs of photos to compare.
+    """Return the pairs of photos to match.
 
-    Each photo is paired with the nearest photos that look in a similar direction.
+    Each photo is paired with the photos of the nearest cameras that look in a similar direction.
     """
     centers = centers_of(views)
     axes = np.stack([view.camera.world_to_camera[2, :3].numpy() for view in views])
     pairs: set[tuple[int, int]] = set()
     for i in range(len(views)):
         distances = np.linalg.norm(centers - centers[i], axis=1)
-        # Cameras at the same position cannot determine depth.
+        # Two cameras at the same position cannot determine a depth.
         distances[(axes @ axes[i] < _ASKEW) | (distances == 0.0)] = np.inf
         near = np.argsort(distances, kind="stable")[:neighbours]
         pairs |= {(min(i, j), max(i, j)) for j in near.tolist() if np.isfinite(distances[j])}
@@ -189,9 +192,9 @@ def _pairs(views: Sequence[View], neighbours: int) -> list[tuple[int, int]]:
 
 
 def _best(pairs: Sequence[tuple[int, int]], met: Sequence[Met]) -> list[tuple[int, int]]:
-    """Return the pair and row of the points to keep.
+    """Return the pair and the row of each match to keep.
 
-    Each feature is used once, in the match with the widest angle.
+    A feature may have matches in several pairs; only its match with the widest angle is kept.
     """
     angles = np.concatenate([common.angles for common in met]) if met else np.zeros(0)
     matches = [(p, m) for p, common in enumerate(met) for m in range(len(common.points))]
@@ -207,11 +210,11 @@ def _best(pairs: Sequence[tuple[int, int]], met: Sequence[Met]) -> list[tuple[in
 
 
 def meet(first: Features, second: Features, pixels: float) -> Met:
-    """Return the features that two photos have in common, and their triangulated points.
+    """Return the matched features of two photos, and their triangulated points.
 
-    Two features match if each descriptor is by a clear margin the nearest of the other. The point
-    is in front of both cameras. The projection of the point is at most `pixels` from the feature in
-    both photos.
+    Two features match if each descriptor is the nearest to the other by a clear margin. A point is
+    kept if it is in front of both cameras. In both photos, its projection must also be at most
+    `pixels` from the feature.
     """
     one, other = _matched(first.descriptors, second.descriptors)
     at = first.pixels[one], second.pixels[other]
@@ -228,9 +231,10 @@ def meet(first: Features, second: Features, pixels: float) -> Met:
 def _matched(
     first: NDArray[np.float32], second: NDArray[np.float32]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the rows of matching descriptors.
+    """Return the rows of matching descriptors in the first and in the second photo.
 
-    Two descriptors match if they are mutually nearest, and clearly nearer than the second-nearest.
+    Two descriptors match if each is the nearest to the other, and clearly nearer than the
+    second-nearest.
     """
     nothing = np.zeros(0, dtype=np.int64)
     if min(len(first), len(second)) <= 1:
@@ -250,7 +254,7 @@ def _matched(
 
 
 def _projection(camera: Camera) -> NDArray[np.float64]:
-    """Return [3, 4] the map from homogeneous points of the local frame to homogeneous pixels."""
+    """Return [3, 4] the projection of homogeneous local points to homogeneous pixels."""
     return np.asarray((camera.matrix @ camera.world_to_camera[:3]).numpy())
 
 
@@ -260,7 +264,9 @@ def _triangulated(
     at: NDArray[np.float64],
     other: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return [M, 3] points whose projections [3, 4] are nearest to pixels [M, 2], linearly.
+    """Return [M, 3] points triangulated linearly.
+
+    The inputs are two projections [3, 4] and two sets of pixels [M, 2].
 
     Source: Hartley and Zisserman, Multiple View Geometry, section 12.2 (homogeneous method).
     """
@@ -276,7 +282,7 @@ def _triangulated(
 
 
 def _angles(first: Camera, second: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return [M] angles at points [M, 3] between the rays to two cameras."""
+    """Return [M] angles between the rays from two cameras to points [M, 3]."""
     rays = [camera.center.numpy() - points for camera in (first, second)]
     with np.errstate(divide="ignore", invalid="ignore"):
         one, other = (ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)

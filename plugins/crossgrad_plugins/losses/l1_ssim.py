@@ -19,24 +19,24 @@ def photometric_loss(
     ssim_weight: float = 0.2,
     weights: Tensor | None = None,
 ) -> Tensor:
-    """Return (1 - w) * L1 + w * (1 - SSIM) over the unmasked pixels; see `reference.l1_ssim_loss`.
+    """Return (1 - w) * L1 + w * (1 - SSIM) over unmasked pixels; see `reference.l1_ssim_loss`.
 
-    In float32, one pass computes value and gradient: a fused kernel on the CPU, torch's operators
-    on other devices. This gradient is first order only. Other types, and calls with weights, use
-    plain torch operators, which can be differentiated again.
+    In float32, value and gradient are computed together: by a compiled kernel on the CPU, and by
+    torch's operators on other devices. This gradient cannot be differentiated again. For other
+    types, or with weights, plain torch operators are used, which can be differentiated again.
 
     Args:
-        image: [H, W, 3] floating point, the render.
-        target: [H, W, 3] floating point or uint8, the photo, on the same device.
-        mask: [H, W] bool, True where the pixel counts; None counts all pixels.
-        ssim_weight: w in [0, 1].
-        weights: [H, W] floating point, not negative; None gives all pixels the same weight.
+        image: [H, W, 3] the render, floating point.
+        target: [H, W, 3] the photo, floating point or uint8, on the device of the render.
+        mask: [H, W] bool, True for pixels that count; None if all pixels count.
+        ssim_weight: The weight w of the SSIM term, in [0, 1].
+        weights: [H, W] non-negative weights of the pixels, floating point; None for equal weights.
 
     Returns:
-        Scalar of the image's type.
+        The loss, a scalar of the image's type.
 
     Raises:
-        ValueError: The shapes do not fit.
+        ValueError: The shapes do not match.
     """
     _check(image, target, mask)
     if weights is not None:
@@ -51,7 +51,10 @@ def photometric_loss(
 
 
 class _FusedLoss(torch.autograd.Function):
-    """Computes the image's gradient in the forward pass, and scales it in the backward pass."""
+    """Computes the gradient with respect to the image in the forward pass.
+
+    The backward pass only scales this gradient.
+    """
 
     @staticmethod
     @override
@@ -86,7 +89,7 @@ class _FusedLoss(torch.autograd.Function):
 
 
 class _DeviceLoss(torch.autograd.Function):
-    """Like `_FusedLoss`, but with torch's operators, for a GPU, without synchronisation."""
+    """Like `_FusedLoss`, but with torch's operators on a GPU, without synchronisation."""
 
     @staticmethod
     @override
@@ -124,12 +127,12 @@ def _check_weights(image: Tensor, weights: Tensor) -> None:
 
 
 class L1SSIM(Loss):
-    """(1 - w) * L1 + w * (1 - SSIM), means over the pixels that count and their channels.
+    """(1 - w) * L1 + w * (1 - SSIM), where both terms are means over unmasked pixels and channels.
 
-    In float32, one pass computes value and gradient; on the CPU this is a fused kernel. Pixel
-    weights and other types use torch's operators and autograd.
+    In float32, value and gradient are computed together; on the CPU, a compiled kernel does this.
+    With pixel weights or other types, torch's operators and autograd are used.
 
-    Source: Kerbl et al. 2023 (3D Gaussian Splatting), eq. 7, with 1 - SSIM as D-SSIM.
+    Source: Kerbl et al. 2023 (3D Gaussian Splatting), eq. 7, with 1 - SSIM for D-SSIM.
     """
 
     ssim_weight: float = Field(0.2, ge=0, le=1, description="weight of 1 - SSIM in the loss")

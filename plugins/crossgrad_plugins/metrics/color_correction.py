@@ -11,26 +11,28 @@ from typing_extensions import override
 from crossgrad_core.plugin import Compared, Figure, Metric, psnr
 from crossgrad_plugins.metrics.ssim import ssim
 
-#: The definition that summary.json contains for every colour-corrected metric.
+#: Definition that summary.json contains for every colour-corrected metric.
 DEFINITION = (
     "of the render after the affine map of RGB (3 x 4, 8-bit sRGB values) that brings it closest "
     "to the photo of the view by least squares over the pixels that count; "
     "clamped and rounded to 8 bits again"
 )
-#: If a render varies in a colour direction by less than this share of its widest direction, the
-#: direction counts as constant. Apart from rounding, a grey render has two constant directions.
+#: If the render's colours vary less than this share along a direction, compared with the widest
+#: direction, the direction counts as constant. A grey render has two constant directions, apart
+#: from rounding errors.
 _FLAT = 1e-10
-#: Number of pixels that are processed at once, so that intermediate results stay in the cache.
+#: Number of pixels that are processed at the same time, so that intermediate results stay in the
+#: cache.
 _AT_ONCE = 2**15
 Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
 
 class ColorCorrectedPSNR(Metric):
-    """PSNR of the render after its colours are fitted to the photo (the metric uses the photo).
+    """PSNR of the render after its colours are fitted to the photo.
 
-    Compared with `psnr`, this metric separates errors of brightness and white balance from errors
-    of the scene.
+    The metric uses the photo. Compared with `psnr`, it separates errors of brightness and white
+    balance from errors of the scene.
     """
 
     figure: ClassVar[Figure] = Figure(
@@ -57,10 +59,10 @@ class ColorCorrectedSSIM(Metric):
 
 
 def color_corrected(compared: Compared) -> Tensor | None:
-    """Return [H, W, 3] uint8: the render after the affine colour map that fits it to the photo.
+    """Return [H, W, 3] uint8: the render after the affine colour map that best fits the photo.
 
-    The map is fitted at unmasked pixels and applied everywhere. The result is None if no pixel
-    counts.
+    The map is fitted to unmasked pixels and applied to all pixels. The result is None if all pixels
+    are masked.
     """
     render, photo = (_kept(image, compared.mask) for image in (compared.render, compared.photo))
     if not len(render):
@@ -75,15 +77,16 @@ def color_corrected(compared: Compared) -> Tensor | None:
 
 
 def _kept(image: Tensor, mask: Tensor | None) -> Bytes:
-    """Return [N, 3] the pixels that count."""
+    """Return [N, 3] colours of the unmasked pixels."""
     kept = image.reshape(-1, 3) if mask is None else image[mask]
     return kept.numpy()
 
 
 def _fit(render: Bytes, photo: Bytes) -> tuple[Floats, Floats]:
-    """Return matrix [3, 3] and offset [3] with `render @ matrix + offset` closest to `photo`.
+    """Return matrix [3, 3] and offset [3] that bring the render closest to the photo.
 
-    Both images are [N, 3]. Of several equally close maps, the map with the smallest matrix is used.
+    The mapped colours are `render @ matrix + offset`. Render and photo are given as [N, 3] colours.
+    If several maps are equally close, the map with the smallest matrix is used.
     """
     sums = _sums(render, photo)
     within, across = _spread(sums, slice(0, 3)), _spread(sums, slice(3, 6))
@@ -93,10 +96,9 @@ def _fit(render: Bytes, photo: Bytes) -> tuple[Floats, Floats]:
 
 
 def _sums(render: Bytes, photo: Bytes) -> Floats:
-    """Return [7, 7] sums of the products of the render's channels, the photo's channels and 1.
+    """Return [7, 7] sums of products of the render's channels, the photo's channels and 1.
 
-    The sums are whole numbers that float64 represents exactly, so the order of addition does not
-    matter.
+    float64 represents these whole numbers exactly, so the order of addition does not matter.
     """
     total = np.zeros((7, 7))
     for at in range(0, len(render), _AT_ONCE):
@@ -108,10 +110,9 @@ def _sums(render: Bytes, photo: Bytes) -> Floats:
 
 
 def _spread(sums: Floats, others: slice) -> Floats:
-    """Return [3, 3] covariances of the render's channels with other channels.
+    """Return [3, 3] covariances between the render's channels and other channels.
 
-    Differences are computed with integers, so the result does not depend on rounding or on the
-    number of threads.
+    Differences are computed with integers, so the result does not depend on rounding or threads.
     """
     exact = [[int(value) for value in row] for row in sums]
     count = exact[6][6]

@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from crossgrad_plugins.metrics.lpips_distance import Weights
 
 
-#: Texts for summary.json about the value range of the images that the network receives.
+#: Texts for summary.json about the value range of the network's input.
 IN_FULL_RANGE: Final = "images in [-1, 1], as the method means it"
 IN_UNIT_RANGE: Final = "images in [0, 1], as 3DGS feeds them"
 
 
 def figure_of(name: str, label: str, net: Trunk, entry: str, scaling: str) -> Figure:
-    """Return the `Figure` of LPIPS without weights; `described` adds the source of the weights."""
+    """Return the `Figure` of LPIPS before the weights are read; `described` adds their source."""
     return Figure(
         name=name,
         label=label,
@@ -39,11 +39,11 @@ def figure_of(name: str, label: str, net: Trunk, entry: str, scaling: str) -> Fi
 class Perceptual(Metric):
     """Learned perceptual similarity (LPIPS 0.1) with weights that the user provides.
 
-    Without a trunk file the result is null, because no Python package contains a trunk. Nothing is
-    ever downloaded.
+    The user must give a trunk file, because no Python package contains a trunk. Without the file,
+    the result is null. Files are never downloaded.
 
     Attributes:
-        net: The network.
+        net: The network whose features are compared.
         entry: The name of the metric, for messages.
     """
 
@@ -69,7 +69,7 @@ class Perceptual(Metric):
 
     @hookimpl
     def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
-        """Read the weights, so that errors appear before training starts."""
+        """Read the weights now, so that errors appear before training starts."""
         if self.trunk is not None:
             self._weights(self.trunk)
         elif self.heads is not None:
@@ -101,14 +101,17 @@ class Perceptual(Metric):
 
     @abstractmethod
     def entering(self, image: Tensor) -> Tensor:
-        """Return an image [H, W, 3] in [0, 1], scaled to the input range of the network."""
+        """Return an image [H, W, 3] in [0, 1], scaled to the value range that the network gets."""
 
     def _weights(self, trunk: Path) -> "Weights":
         return _kept(self.net, trunk, self.heads, f"metrics.{self.entry}")
 
 
 class LPIPS(Perceptual):
-    """Learned perceptual similarity with AlexNet, images in [-1, 1]; lower is better."""
+    """Learned perceptual similarity with AlexNet; lower is better.
+
+    Images are scaled to [-1, 1].
+    """
 
     net: ClassVar[Trunk] = ALEXNET
     entry: ClassVar[str] = "lpips"
@@ -120,7 +123,10 @@ class LPIPS(Perceptual):
 
 
 class LPIPSOfVGG(Perceptual):
-    """Learned perceptual similarity with VGG-16, images in [-1, 1]; lower is better."""
+    """Learned perceptual similarity with VGG-16; lower is better.
+
+    Images are scaled to [-1, 1].
+    """
 
     net: ClassVar[Trunk] = VGG16
     entry: ClassVar[str] = "lpips-vgg"
@@ -132,10 +138,10 @@ class LPIPSOfVGG(Perceptual):
 
 
 class LPIPSOfVGGAs3DGS(Perceptual):
-    """Learned perceptual similarity with VGG-16, images in [0, 1] as in the 3DGS code.
+    """Learned perceptual similarity with VGG-16 on images in [0, 1], as in the 3DGS code.
 
-    The network expects images in [-1, 1], so it sees low contrast. The result can be compared only
-    with LPIPS values of papers of the 3DGS family, and with no other LPIPS.
+    The network was trained for images in [-1, 1], so images in [0, 1] have too little contrast for
+    it. The result can be compared only with LPIPS values in papers that use the 3DGS code.
     """
 
     net: ClassVar[Trunk] = VGG16

@@ -1,4 +1,4 @@
-"""The distance of two images by the features of a network, and the files of its weights."""
+"""The LPIPS distance of two images by the features of a network, and the files of its weights."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -13,12 +13,12 @@ from torch.nn import functional
 from crossgrad_core.plugin import UserError
 from crossgrad_plugins.metrics.lpips_trunks import Convolution, Trunk
 
-#: Mean and standard deviation of ImageNet's colours for images in [-1, 1], as in LPIPS.
+#: Mean and standard deviation of ImageNet's colours, converted to images in [-1, 1] as in LPIPS.
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
-#: Lower limit that keeps the length of a feature vector above 0.
+#: Lower limit that prevents a division by a zero length of a feature vector.
 _LEAST = 1e-8
-#: Packages that contain the published LPIPS heads, and the folders of the heads in these packages.
+#: Packages with the published LPIPS heads, and the folder of the heads in each package.
 _PACKAGES = (
     ("torchmetrics", ("functional", "image", "lpips_models")),
     ("lpips", ("weights", "v0.1")),
@@ -28,11 +28,11 @@ _SAFETENSORS = ".safetensors"
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """All weights that LPIPS with one trunk needs.
+    """All weights that LPIPS needs with one trunk.
 
     Attributes:
-        trunk: (weights [O, I, H, W], biases [O]) of the trunk's convolutions in order.
-        heads: [1, C, 1, 1] linear heads of the convolutions that are compared.
+        trunk: (weights [O, I, H, W], biases [O]) of the trunk's convolutions, in order.
+        heads: [1, C, 1, 1] linear heads of the compared convolutions.
         source: A text that names the files, for summary.json.
     """
 
@@ -42,11 +42,11 @@ class Weights:
 
 
 def distance(net: Trunk, weights: Weights, first: Tensor, second: Tensor) -> float:
-    """Return the LPIPS of two images [H, W, 3]; the method expects values in [-1, 1].
+    """Return the LPIPS of two images [H, W, 3], whose values should be in [-1, 1].
 
     Source: Zhang et al. 2018, The Unreasonable Effectiveness of Deep Features as a Perceptual
-    Metric, version 0.1: features of unit length, squared differences, weighted by channel, mean
-    over the pixels, sum over the layers.
+    Metric, version 0.1. Features are scaled to unit length. Their squared differences are weighted
+    by channel, averaged over the pixels, and summed over the layers.
     """
     with torch.no_grad():
         pairs = zip(_features(net, weights, first), _features(net, weights, second), strict=True)
@@ -58,7 +58,7 @@ def distance(net: Trunk, weights: Weights, first: Tensor, second: Tensor) -> flo
 
 
 def _features(net: Trunk, weights: Weights, image: Tensor) -> Iterator[Tensor]:
-    """Yield the output [1, C, h, w] of each compared convolution, after its ReLU."""
+    """Yield the output [1, C, h, w] of each compared convolution after its ReLU."""
     shift, scale = image.new_tensor(_SHIFT), image.new_tensor(_SCALE)
     x = ((image - shift) / scale).permute(2, 0, 1)[None]
     for layer, (weight, bias) in zip(net.layers, weights.trunk, strict=True):
@@ -70,7 +70,7 @@ def _features(net: Trunk, weights: Weights, image: Tensor) -> Iterator[Tensor]:
 
 
 def _unit(features: Tensor) -> Tensor:
-    """Return the features of each pixel, scaled to length 1."""
+    """Return features whose vector at each pixel is scaled to length 1."""
     return features / (_LEAST + features.square().sum(dim=1, keepdim=True)).sqrt()
 
 
@@ -84,7 +84,8 @@ def read_weights(net: Trunk, trunk: Path, heads: Path | None, setting: str) -> W
         setting: The user's setting for the weights, such as `metrics.lpips`.
 
     Raises:
-        UserError: A file is missing, has no weights, or has the weights of another network.
+        UserError: A file is missing, contains no weights, or contains the weights of another
+            network.
     """
     of_trunk = _read_trunk(net, trunk, f"{setting}.trunk")
     file, whose = (heads, heads.name) if heads is not None else _installed(net, setting)
@@ -121,7 +122,7 @@ def _read_heads(net: Trunk, path: Path, setting: str) -> tuple[Tensor, ...]:
 
 
 def _installed(net: Trunk, setting: str) -> tuple[Path, str]:
-    """Return the heads in an installed package, and its name, without importing it."""
+    """Return the heads in an installed package and the package's name, without an import."""
     for package, folders in _PACKAGES:
         spec = find_spec(package)
         for location in (spec.submodule_search_locations or ()) if spec is not None else ():
@@ -138,7 +139,7 @@ def _installed(net: Trunk, setting: str) -> tuple[Path, str]:
 
 
 def _read(path: Path, todo: str) -> Mapping[str, Tensor]:
-    """Return the tensors of a file by name; nothing in the file is executed."""
+    """Return the tensors of a file by name; code in the file is not executed."""
     if not path.is_file():
         raise UserError("the file of weights does not exist", where=path, todo=todo)
     try:
@@ -146,11 +147,11 @@ def _read(path: Path, todo: str) -> Mapping[str, Tensor]:
             from safetensors.torch import load_file
 
             return load_file(path)
-        # Map to the CPU, so that files written on a GPU can be read without a GPU.
+        # Load to the CPU, so that files written on a GPU can be read without a GPU.
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # Exceptions for damaged files are not documented.
-        # Do not show torch's own message, because it ends with the advice to execute code from the
-        # file.
+    # torch does not document which exceptions it raises for damaged files.
+    except Exception as error:
+        # Do not show torch's own message, because it advises users to execute code from the file.
         raise _unreadable(path, f"{type(error).__name__} while reading", todo) from error
     if not isinstance(content, Mapping):
         raise _unreadable(path, f"an object of type {type(content).__name__}", todo)
@@ -170,7 +171,7 @@ def _unreadable(path: Path, found: str, todo: str) -> UserError:
 def _check(
     path: Path, tensors: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]], todo: str
 ) -> None:
-    """Raise an error for weights of another network or for non-finite values."""
+    """Raise an error if the weights belong to another network or are not finite."""
     for name, shape in shapes.items():
         tensor = tensors.get(name)
         if tensor is None or tuple(tensor.shape) != shape:
@@ -191,9 +192,9 @@ def _check(
 
 
 def _described(net: Trunk, path: Path) -> str:
-    """Return a text that identifies the file.
+    """Return a text that identifies a file by its name and content.
 
-    Results of different weight files cannot be compared.
+    Results with different weight files cannot be compared.
     """
     digest = sha256(path.read_bytes()).hexdigest()
     published = "" if digest.startswith(net.digest) else "not "

@@ -1,8 +1,8 @@
-"""The networks whose features LPIPS compares, without the layers that LPIPS does not use.
+"""The networks whose features LPIPS compares.
 
-Layers and their numbers are as in torchvision's `alexnet` and `vgg16` (`features`), so that
-torchvision's weight files can be loaded. Sources: Krizhevsky 2014 (arXiv 1404.5997); Simonyan and
-Zisserman 2015 (1409.1556).
+Layers that LPIPS does not use are left out. Layers have the numbers of torchvision's `alexnet` and
+`vgg16` (`features`), so that torchvision's weight files can be loaded. Sources: Krizhevsky 2014
+(arXiv 1404.5997); Simonyan and Zisserman 2015 (1409.1556).
 """
 
 from dataclasses import dataclass
@@ -15,10 +15,10 @@ class Convolution:
     """A convolution followed by a ReLU.
 
     Attributes:
-        layer: Number of the convolution in `features`.
-        shape: (channels out, channels in, height, width) of its weights.
-        stride: Pixels.
-        padding: Pixels.
+        layer: Number of the convolution in torchvision's `features`.
+        shape: Shape of its weights: output channels, input channels, height, width.
+        stride: Stride, pixels.
+        padding: Padding, pixels.
         pools: True if max pooling precedes the convolution.
         compared: True if LPIPS compares the output of the convolution.
     """
@@ -39,10 +39,10 @@ class Trunk:
         name: The common name of the network.
         model: The name of the network in torchvision.
         heads: Name of the file with the linear heads.
-        published: Name of the weight file that LPIPS was fitted on; the last part of the name is
-            the beginning of the file's SHA-256.
-        window: Side of the max-pooling windows, pixels; their stride is 2.
-        smallest: Smallest side of an image, pixels.
+        published: Name of the weight file with which LPIPS was fitted; the name ends with the first
+            digits of the file's SHA-256.
+        window: Side length of the max-pooling windows, pixels; their stride is 2.
+        smallest: Smallest side length of an image, pixels.
         layers: The convolutions in order.
     """
 
@@ -61,14 +61,14 @@ class Trunk:
 
     @property
     def digest(self) -> str:
-        """The beginning of the SHA-256 of the published file."""
+        """The first digits of the published file's SHA-256."""
         return self.published.rpartition("-")[2].partition(".")[0]
 
 
 def _vgg(stages: tuple[tuple[int, int], ...]) -> tuple[Convolution, ...]:
-    """Return the convolutions of stages of (convolutions, channels).
+    """Return the convolutions of VGG; a stage is given as (number of convolutions, channels).
 
-    Max pooling separates stages, and the last convolution of each stage is compared.
+    Max pooling follows each stage, and the last convolution of each stage is compared.
     """
     layers: list[Convolution] = []
     number, channels_in = 0, 3
@@ -85,7 +85,7 @@ def _vgg(stages: tuple[tuple[int, int], ...]) -> tuple[Convolution, ...]:
                 )
             )
             number, channels_in = number + 2, width
-        number += 1  # In the sequence, a max pooling layer has its own number.
+        number += 1  # Max-pooling layers are numbered, too.
     return tuple(layers)
 
 

@@ -10,7 +10,7 @@ from crossgrad_core.plugin import Compared, Figure, Metric, psnr
 class PSNR(Metric):
     """Peak signal-to-noise ratio over the unmasked pixels and their channels, in dB.
 
-    The maximum is 100 dB, for identical images. Source: 3DGS evaluation script.
+    For identical images, the result is 100 dB. Source: evaluation script of 3DGS.
     """
 
     figure: ClassVar[Figure] = Figure(

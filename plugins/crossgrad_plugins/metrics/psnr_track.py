@@ -1,4 +1,4 @@
-"""Peak signal-to-noise ratio with the view's exposure taken from its SfM observations."""
+"""PSNR after the render gets the view's exposure, which is estimated at SfM points."""
 
 from typing import ClassVar
 
@@ -13,16 +13,16 @@ from crossgrad_plugins.exposures.srgb import encoded, with_gain
 from crossgrad_plugins.exposures.tracks.gains import LEAST
 from crossgrad_plugins.exposures.tracks.observations import light_at
 
-#: Step sizes of the search for a gain around the first estimate, in stops, from coarse to fine.
+#: Step sizes, in stops, of the search for a gain around the first estimate, from coarse to fine.
 _STEPS = (0.1, 0.01)
 _TRIED = 15
 
 
 class TrackExposedPSNR(Metric):
-    """PSNR of the render multiplied, in linear light, by one gain from SfM observations.
+    """PSNR of the render after one gain in linear light, estimated from SfM observations.
 
-    The gain brings render and photo closest together at the SfM points that the photo observed. The
-    metric uses the photo only at these points, which also determined its pose.
+    The gain minimises the difference of render and photo at the SfM points that the photo observed.
+    The metric uses the photo only at these points, from which SfM also estimated the photo's pose.
     """
 
     figure: ClassVar[Figure] = Figure(
@@ -50,7 +50,7 @@ class TrackExposedPSNR(Metric):
 
 
 def _closest(drawn: Tensor, compared: Compared) -> float | None:
-    """Return the gain in stops; None if too few observations are usable."""
+    """Return the gain in stops, or None if too few observations are usable."""
     camera = compared.view.camera
     of_photo = light_at(compared.photo, compared.mask, camera, compared.points)
     if np.count_nonzero(of_photo.usable) < LEAST:
@@ -61,7 +61,7 @@ def _closest(drawn: Tensor, compared: Compared) -> float | None:
     lit = light > 0.0
     if not lit.any():
         return 0.0
-    # Use the median, because a single light source far brighter than white would dominate a sum.
+    # Use the median, because one light source far brighter than white would dominate a sum.
     stops = float(np.log2(np.median(wanted[lit] / light[lit])))
     for step in _STEPS:
         tried = stops + step * np.arange(-_TRIED, _TRIED + 1)
@@ -71,9 +71,9 @@ def _closest(drawn: Tensor, compared: Compared) -> float | None:
 
 
 def _distances(lights: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean squared differences, in sRGB, between lights [L, N] and the wanted light [N].
+    """Return the mean squared sRGB differences of lights [L, N] from the photo's light [N].
 
-    Values beyond white are clipped to white, as in the comparison of the render with the photo.
+    Values above white are clipped to white, as in the comparison of render and photo.
     """
     srgb_lights, srgb_wanted = (
         encoded(torch.from_numpy(brightness)).clamp(max=1.0) for brightness in (lights, wanted)

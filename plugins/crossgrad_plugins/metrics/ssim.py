@@ -1,8 +1,8 @@
-"""Structural similarity, computed as in the 3DGS family and as in scikit-image.
+"""Structural similarity (SSIM), computed as in the 3DGS code and as in scikit-image.
 
-Both metrics first clamp the images to [0, 1] and round them to 8 bits, like a render that is
-written to a file and read back. With a mask, only unmasked pixels count; a masked pixel is 0 in
-both images.
+Both metrics first clamp the images to [0, 1] and round them to 8 bits, as if the render were
+written to a file. With a mask, only unmasked pixels count, and masked pixels are set to 0 in both
+images.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -21,12 +21,13 @@ SSIM_SKIMAGE_TOO_SMALL = (
     f"scikit-image's SSIM needs kept pixels at least {RADIUS} pixels from the border, "
     f"in an image of {WINDOW} x {WINDOW} or more"
 )
-#: Number of rows that a thread processes at once, so that intermediate results stay in the cache.
+#: Number of rows that a thread processes at the same time, so that intermediate results stay in the
+#: cache.
 _ROWS = 128
 
 
 class SSIM(Metric):
-    """Structural similarity in the form of 3DGS: 11 x 11 window, sigma 1.5, zero padding."""
+    """Structural similarity as in the 3DGS code: 11 x 11 window, sigma 1.5, zero padding."""
 
     figure: ClassVar[Figure] = Figure(
         name="ssim",
@@ -41,7 +42,10 @@ class SSIM(Metric):
 
 
 class SSIMOfSkimage(Metric):
-    """Structural similarity of scikit-image: Gaussian weights, sigma 1.5, no sample covariance."""
+    """Structural similarity of scikit-image with Gaussian weights and sigma 1.5.
+
+    It uses no sample covariance.
+    """
 
     figure: ClassVar[Figure] = Figure(
         name="ssim_skimage",
@@ -56,10 +60,10 @@ class SSIMOfSkimage(Metric):
 
 
 def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
-    """Return the SSIM as in the loss: 11 x 11 Gaussian window, sigma 1.5, zero-padded.
+    """Return the SSIM as in the loss: 11 x 11 Gaussian window, sigma 1.5, zero padding.
 
-    The arguments are the same as those of `psnr`. The result is the mean over the unmasked pixels;
-    None if no pixel counts.
+    The arguments are those of `psnr`. The result is the mean over the unmasked pixels, or None if
+    all pixels are masked.
     """
     from crossgrad_plugins.losses.photometric.numba_kernels.fused import loss_terms
 
@@ -72,13 +76,13 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | N
 
 
 def ssim_skimage(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
-    """Return the SSIM of scikit-image with Gaussian weights, sigma 1.5, without sample covariance.
+    """Return the SSIM of scikit-image with Gaussian weights and sigma 1.5.
 
-    As in scikit-image, the mean excludes a border of 5 pixels, where windows extend beyond the
-    image.
+    It uses no sample covariance. As in scikit-image, a border of 5 pixels is left out of the mean,
+    because windows there extend beyond the image.
 
-    The arguments are the same as those of `psnr`. The result is None if no pixel is left;
-    `SSIM_SKIMAGE_TOO_SMALL` is the reason.
+    The arguments are those of `psnr`. The result is None if no pixel is left;
+    `SSIM_SKIMAGE_TOO_SMALL` states the reason.
     """
     height, width = image.shape[:2]
     inside = torch.zeros(height, width, dtype=torch.bool)
@@ -91,9 +95,10 @@ def ssim_skimage(image: Tensor, target: Tensor, mask: Tensor | None = None) -> f
 
 
 def _skimage_map(image: Tensor, target: Tensor, mask: Tensor | None) -> NDArray[np.float64]:
-    """Return the SSIM per pixel and channel, [H, W, 3]; a border of RADIUS pixels is undefined.
+    """Return [H, W, 3] SSIM per pixel and channel; a border of RADIUS pixels is undefined.
 
-    A value depends only on pixels within RADIUS, so strips give the same bits as the whole image.
+    A value depends only on pixels within RADIUS, so processing in strips gives the same bits as the
+    whole image.
     """
     from skimage.metrics import structural_similarity
 
@@ -104,7 +109,7 @@ def _skimage_map(image: Tensor, target: Tensor, mask: Tensor | None) -> NDArray[
 
     def work(start: int) -> None:
         stop = min(start + _ROWS, height)
-        # Include rows above, because the last rows alone may be too few for a window.
+        # Add rows above the last strip, because it may have too few rows for a window.
         first = max(min(start - RADIUS, height - WINDOW), 0)
         last = min(stop + RADIUS, height)
         _, full = structural_similarity(

@@ -1,4 +1,4 @@
-"""Progress of a run: a bar in a terminal or notebook, else plain lines on stderr."""
+"""Progress of a run: a bar in a terminal or notebook, otherwise plain lines on stderr."""
 
 import sys
 from time import monotonic
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 _BAR = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
 
-#: Counts that are not shown, because most steps report them.
+#: Counts that the progress display omits, because most steps report them.
 _OF_AGGREGATION = frozenset({"zero", "disjoint", "dropped", "conflict"})
 
 
@@ -38,7 +38,8 @@ class Progress(Observer):
 
     Attributes:
         level: The amount of output.
-        interval: Seconds between plain lines; a line is also written at every tenth of the run.
+        interval: Seconds between two plain lines; a line is also written after every tenth of the
+            run.
     """
 
     level: Literal["quiet", "normal", "verbose"] = Field(
@@ -50,7 +51,7 @@ class Progress(Observer):
         10.0, gt=0.0, description="seconds between lines if the output is not a terminal"
     )
 
-    # The state of the display. It is not part of the run's state.
+    # Variables of the display. These variables are not stored in checkpoints.
     _pace: Pace = PrivateAttr(default_factory=lambda: Pace(1))
     _tenth: int = PrivateAttr(default=1)
     _bar: "tqdm[Any] | None" = PrivateAttr(default=None)
@@ -58,7 +59,10 @@ class Progress(Observer):
 
     @hookimpl
     def crossgrad_run_start(self, run: RunInfo) -> None:
-        """Show the scene, the length, the device and the decisions; with `verbose` all notes."""
+        """Show the scene, the length, the device and the decisions.
+
+        With level `verbose`, show all notes.
+        """
         self._pace = Pace(run.schedule.total)
         self._tenth = max(1, self._pace.total // 10)
         self._last_line = monotonic()
@@ -78,7 +82,7 @@ class Progress(Observer):
 
     @hookimpl
     def crossgrad_step_end(self, record: StepRecord) -> None:
-        """Move the bar, or write a line at intervals."""
+        """Update the bar, or write a line at intervals."""
         if self.level == "quiet":
             return
         self._pace = self._pace.after(record)
@@ -92,7 +96,7 @@ class Progress(Observer):
 
     @hookimpl
     def crossgrad_length_changed(self, total: int) -> None:
-        """Move the end of the bar."""
+        """Change the length of the bar."""
         self._pace = self._pace.with_length(total)
         if self._bar is not None:
             self._bar.total = total
@@ -112,7 +116,7 @@ class Progress(Observer):
 
     @hookimpl
     def crossgrad_run_end(self, status: str) -> None:
-        """Leave the finished bar on the screen, and show how the run ended."""
+        """Keep the finished bar on the screen, and show how the run ended."""
         if self._bar is not None:
             self._bar.close()
             self._bar = None
@@ -155,5 +159,5 @@ class Progress(Observer):
             sys.stderr.write(text + "\n")
             sys.stderr.flush()
         else:
-            # `tqdm` writes the line above the bar. A normal print would break the bar.
+            # `tqdm.write` prints the line above the bar. A normal print would damage the bar.
             self._bar.write(showable(text), file=controls_of(sys.stderr))

@@ -1,1 +1,1 @@
-"""`crossgrad plan` and `--plan`: decisions on the settings of a run, with verifiable evidence."""
+"""`crossgrad plan` and `--plan`: decisions about the settings of a run, with their evidence."""

@@ -23,19 +23,18 @@ from crossgrad_plugins.planner.finding import Finding
 from crossgrad_plugins.planner.length import length
 from crossgrad_plugins.planner.planner import Plan, plan_of
 
-#: In terminals narrower than this, the cost and the option of a part are printed below its
-#: evidence.
+#: In terminals with fewer columns, cost and option of a decision are printed below its evidence.
 _WIDE: Final = 110
 _HEADER: Final = ("part", "decision", "evidence", "cost saved", "force with")
-#: Widths of the columns of a wide table. The evidence gets the remaining width.
+#: Widths of the columns in a wide table. The evidence column gets the remaining width.
 _WIDTHS: Final = (14, 20, 0, 18, 23)
 _GAP: Final = "  "
-#: Basis of a choice -> text that is printed after the choice.
+#: Origin of a choice -> text that is printed after the choice.
 _MARKS: Final = {"decided": "", "default": " (default)", "given": " (yours)"}
 
 
 def lines_of(plan: Plan, width: int) -> Iterator[str]:
-    """Yield the table of findings, and the settings that change, in lines of `width` characters."""
+    """Yield the table of findings and the changed settings, in lines of `width` characters."""
     rows = [_HEADER, *map(_cells, plan.findings)]
     for row in rows:
         yield from _wide(row, width) if width >= _WIDE else _narrow(row, width)
@@ -55,7 +54,7 @@ def _cells(finding: Finding) -> tuple[str, ...]:
 
 
 def _wide(row: Sequence[str], width: int) -> Iterator[str]:
-    """Yield the lines of a row in columns, each cell wrapped."""
+    """Yield the lines of a finding in columns; each cell is wrapped."""
     rest = width - sum(_WIDTHS) - len(_GAP) * (len(_WIDTHS) - 1)
     widths = [column_width or rest for column_width in _WIDTHS]
     cells = [_wrapped(text, space) for text, space in zip(row, widths, strict=True)]
@@ -65,7 +64,7 @@ def _wide(row: Sequence[str], width: int) -> Iterator[str]:
 
 
 def _narrow(row: Sequence[str], width: int) -> Iterator[str]:
-    """Yield the lines of a row as a block: part and decision, then evidence, cost and option."""
+    """Yield the lines of a finding as a block: decision, evidence, cost and option."""
     part, choice, *below = row
     indent = " " * (_WIDTHS[0] + len(_GAP))
     yield f"{part.ljust(_WIDTHS[0])}{_GAP}{choice}"
@@ -81,7 +80,7 @@ def _wrapped(text: str, width: int) -> list[str]:
     return wrap(text, max(1, width), break_on_hyphens=False) or [""]
 
 
-#: Width of the output if the terminal does not report its width.
+#: Width of the output if the width of the terminal is unknown.
 _COLUMNS = 120
 
 
@@ -92,20 +91,22 @@ def plan(
     probe_seconds: float | None,
     write: Path | None,
 ) -> tuple[Plan, str]:
-    """Plan a run on a scene, and return the command that runs it.
+    """Plan a run on a scene, and return the plan and the command that starts the run.
 
     Args:
         file: Configuration file of the run, or None.
-        options: Options of the run that the user gave; None means not given.
-        assignments: `KEY=VALUE` texts.
-        probe_seconds: Training seconds of a probe, or None.
+        options: Options of the run from the command line; None means that an option was not given.
+        assignments: Texts `KEY=VALUE`.
+        probe_seconds: Training time in seconds for a probe, a short run that measures gradients;
+            None for no probe.
         write: Output file for the run's settings, or None.
 
     Returns:
-        The plan, and the command that carries it out.
+        The plan, and the command that runs it.
 
     Raises:
-        UserError: The input is invalid, or the file cannot be written; nothing was written.
+        UserError: An input is invalid, or the file cannot be written. In both cases, no file is
+            written.
     """
     if write is not None:
         _check_free(write)
@@ -114,10 +115,10 @@ def plan(
     scene, _ = read_scene(config)
     made = plan_of(config, scene, probe_seconds)
     if write is not None:
-        # Write the time limit too, because the bundled scene has its own default length. This
-        # default is lost if the file names the scene.
+        # Write the time limit too, because the default length of the bundled scene does not apply
+        # if the file names the scene.
         seconds = {} if config.seconds is None else {"seconds": config.seconds}
-        # An absolute path, so that the file also works from another folder.
+        # Write an absolute path, so that the file can be used from another folder.
         asked = {**settings, **seconds, "scene": str(Path(str(config.scene)).resolve())}
         write_settings(write, {**made.applied_to(asked), "plan": "off"})
         return made, f"run it: crossgrad run --config {quote(str(write))}"
@@ -128,7 +129,7 @@ def plan(
 
 
 def advised(scene: Path) -> tuple[str, str]:
-    """Return the length that the planner advises for a scene, and the training command.
+    """Return the length that the planner recommends for a scene, and the training command.
 
     No photo is decoded.
 
@@ -141,7 +142,10 @@ def advised(scene: Path) -> tuple[str, str]:
 
 
 def _command(scene: Path | None, options: Mapping[str, object], assignments: Sequence[str]) -> str:
-    """Return the command that trains a scene as planned; without a scene, the bundled one."""
+    """Return the command that trains a scene as planned.
+
+    Without a scene, the bundled scene is used.
+    """
     given = {**options, "scene": None}
     words = ["crossgrad run"] if scene is None else ["crossgrad run", quote(str(scene))]
     words += [

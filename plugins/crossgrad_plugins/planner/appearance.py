@@ -1,4 +1,4 @@
-"""Decisions about exposure, degree of spherical harmonics, and the scale filter."""
+"""Decisions about exposure, degree of spherical harmonics, and the 3D scale filter."""
 
 from math import isnan
 from typing import Final
@@ -6,18 +6,18 @@ from typing import Final
 from crossgrad_plugins.planner.evidence import Evidence
 from crossgrad_plugins.planner.finding import Finding, given
 
-#: View dependence is worth its cost only if it explains at least this share of the variance of
-#: tracks.
+#: Higher SH degrees are used only if view dependence explains at least this share of the variance
+#: of tracks.
 LEAST_SHARE: Final = 0.02
-#: Number of values per Gaussian without higher bands: position, shape, opacity and colour.
+#: Number of values per Gaussian without SH bands above 0: position, shape, opacity and colour.
 _OTHER_NUMBERS: Final = 14
-#: If the largest footprint is less than this many times the smallest footprint, all photos show the
+#: If the largest footprint of a view is below this multiple of the smallest, all photos show the
 #: scene at one scale.
 ONE_SCALE: Final = 2.0
 
 
 def exposure(evidence: Evidence) -> Finding:
-    """Decide whether each photo gets an exposure."""
+    """Decide if each photo gets an exposure."""
     part, config = "exposure", evidence.config
     if evidence.is_given("exposure", "exposure_from") or not evidence.is_measured:
         chosen = config.exposure.name if config.exposure else "default of a run"
@@ -64,7 +64,7 @@ def exposure(evidence: Evidence) -> Finding:
 
 
 def degree(evidence: Evidence) -> Finding:
-    """Decide the degree of spherical harmonics from the dependence of colour on the direction."""
+    """Decide the degree of spherical harmonics by how much colour depends on the direction."""
     part, config = "SH degree", evidence.config
     name = config.backbone.name
     of_bands = ("backbone.sh_degree", "backbone.lr_f_rest", "sh_from", "rules.sparse-sh")
@@ -89,7 +89,7 @@ def degree(evidence: Evidence) -> Finding:
 
 
 def _of_tracks(evidence: Evidence, plain: Finding) -> Finding:
-    """Decide the degree by the view dependence of the tracks."""
+    """Decide the degree by the view dependence of SfM tracks."""
     from crossgrad_plugins.planner.view_dependence import (
         FEWEST_TRACKS,
         LEAST_OBSERVATIONS,
@@ -126,7 +126,7 @@ def _of_tracks(evidence: Evidence, plain: Finding) -> Finding:
 
 
 def scale_filter(evidence: Evidence) -> Finding:
-    """Decide whether Gaussians are filtered to the sampling of the photos."""
+    """Decide if Gaussians are filtered to the sampling rate of the photos."""
     part, name = "scale filter", evidence.config.backbone.name
     if evidence.is_given("backbone"):
         return given(part, f"default of backbone {name}", "--backbone mip")

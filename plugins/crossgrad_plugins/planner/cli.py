@@ -11,7 +11,7 @@ _RESULTS = "Results"
 
 @dataclass(frozen=True)
 class Options:
-    """The options of the command."""
+    """Options of the command."""
 
     scene: Path | None = argument(
         "SCENE", "Scene folder. Default: the bundled example scene.", default=None
@@ -53,10 +53,10 @@ class Options:
 def plan(given: Options) -> None:
     """Decide which components a run needs, and show the evidence.
 
-    Reads cameras, photos, SfM points and tracks; trains only with --probe. A table shows each
-    decision, its evidence, what it saves, and the option that overrides it. If evidence is missing,
-    the default is used. `crossgrad run` makes the same decisions, except with `--plan off`.
-    `crossgrad recipes show` lists the decisions of the recipe.
+    The command reads cameras, photos, SfM points and tracks. It trains only with --probe. A table
+    shows each decision, its evidence, the cost that it saves, and the option that overrides it. If
+    evidence is missing, the decision is the default. `crossgrad run` makes the same decisions,
+    unless `--plan off` is given. `crossgrad recipes show` lists the decisions of the recipe.
     """
     announce(quiet=given.as_json)
     from crossgrad_plugins.planner import app

@@ -1,4 +1,4 @@
-"""Decisions on initialization, held-out photos, lenses, masks and background."""
+"""Decisions about initialization, held-out photos, lenses, masks and background."""
 
 import re
 from collections import Counter
@@ -7,14 +7,14 @@ from typing import Final
 from crossgrad_plugins.planner.evidence import Evidence
 from crossgrad_plugins.planner.finding import Finding, given
 
-#: A single photo shares no points with another photo.
+#: A scene with only one photo has no shared points.
 _ONE_PHOTO: Final = 1
-#: The reader's note on the colour over which transparent photos were blended.
+#: Beginning of the reader's note about the colour over which transparent photos were blended.
 _BLENDED: Final = re.compile(r"blended over RGB \(([\d.]+), ([\d.]+), ([\d.]+)\)")
 
 
 def start(evidence: Evidence) -> Finding:
-    """Decide from which points training starts."""
+    """Decide the points from which training starts."""
     part, config = "initializer", evidence.config
     if evidence.is_given("initializer", "data.init"):
         chosen = config.initializer.name if config.initializer else config.data.init
@@ -46,7 +46,7 @@ def start(evidence: Evidence) -> Finding:
 
 
 def held_out(evidence: Evidence) -> Finding:
-    """Report which photos are held out, and whether every regime has held-out photos."""
+    """Report which photos are held out, and if every regime has held-out photos."""
     part, scene = "held out", evidence.scene
     photos = Counter(view.regime for view in scene.test_views)
     chosen = ", ".join(f"{number} of {name}" for name, number in sorted(photos.items())) or "none"
@@ -70,7 +70,7 @@ def held_out(evidence: Evidence) -> Finding:
 
 
 def undistortion(evidence: Evidence) -> Finding:
-    """Report whether photos were undistorted."""
+    """Report if photos were undistorted."""
     note = evidence.scene_note("undistorted")
     plain = Finding(
         "undistortion",
@@ -87,7 +87,7 @@ def undistortion(evidence: Evidence) -> Finding:
 
 
 def masks(evidence: Evidence) -> Finding:
-    """Report whether pixels are masked."""
+    """Report if pixels are masked."""
     part = "masks"
     if evidence.is_given("data.masks"):
         return given(part, evidence.config.data.masks, "--set data.masks=FOLDER")

@@ -1,4 +1,4 @@
-"""The evidence for decisions: statistics of the scene and, if allowed, of a probe."""
+"""The evidence for decisions: statistics of the scene and, if requested, of a probe."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,12 +14,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """The evidence about a planned run; each value is computed at first use.
+    """The evidence about a planned run.
+
+    Each value is computed when it is first used.
 
     Attributes:
-        config: The configuration, which contains only settings of the user.
+        config: The configuration with only the user's settings.
         scene: The scene of the run.
-        seconds: Training seconds of the probe; None if no probe is allowed.
+        seconds: Training time of the probe in seconds; None for no probe.
     """
 
     config: RunConfig
@@ -27,14 +29,14 @@ class Evidence:
     seconds: float | None = None
 
     def is_given(self, *names: str) -> bool:
-        """Return True if the user set any of these settings; a value of None counts as not set.
+        """Return True if the user set any of the settings; the value None counts as not set.
 
         Args:
-            names: Settings, such as `exposure`, `data.init` or `backbone.sh_degree`.
+            names: Names of settings, such as `exposure`, `data.init` or `backbone.sh_degree`.
         """
         settings = {n for n in self.config.model_fields_set if getattr(self.config, n) is not None}
-        # A run also stores its defaults. In the group `data`, a setting with its default value
-        # therefore counts as not set.
+        # The configuration of a run also contains default values. In the group `data`, a setting
+        # with its default value therefore counts as not set.
         data, defaults = self.config.data, type(self.config.data)()
         settings |= {
             f"data.{n}" for n in data.model_fields_set if getattr(data, n) != getattr(defaults, n)
@@ -45,18 +47,18 @@ class Evidence:
 
     @cached_property
     def modes(self) -> Modes:
-        """The modes of the camera distances."""
+        """The modes (clusters) of the camera distances."""
         return modes_of(self.scene)
 
     @cached_property
     def sampler(self) -> Sampler:
-        """The sampler as configured, before any decision."""
+        """The sampler of the configuration, before any decision."""
         choice = self.config.sampler
         return build_component(Sampler, choice.name, choice.options)
 
     @property
     def grouping(self) -> ComponentChoice:
-        """The grouping into near and far views: the user's choice, or the cut between the modes."""
+        """The grouping into near and far views: the user's, or a cut between the modes."""
         if self.config.grouping is not None:
             return self.config.grouping
         if self.is_given("sampler") and self.sampler.default_grouping is not None:
@@ -65,7 +67,7 @@ class Evidence:
 
     @cached_property
     def probe(self) -> "Probe | None":
-        """The results of a short training run; None if no probe is allowed."""
+        """The measurements of a short training run; None if no probe was requested."""
         if self.seconds is None:
             return None
         from crossgrad_plugins.planner.probe import probed
@@ -74,12 +76,15 @@ class Evidence:
 
     @cached_property
     def view_plan(self) -> ViewsPerStepSpec:
-        """The number of views per step as configured, before any decision."""
+        """The number of views per step in the configuration, before any decision."""
         return views_per_step_of(self.config)[0]
 
     @property
     def is_measured(self) -> bool:
-        """True if the run uses recipe `auto`, with which the planner's rules were measured."""
+        """True if the run uses recipe `auto`.
+
+        The rules of the planner were measured with this recipe.
+        """
         return self.config.recipe.name == "auto"
 
     @cached_property
@@ -90,7 +95,7 @@ class Evidence:
 
     @property
     def degree(self) -> int | None:
-        """The highest degree of the backbone's spherical harmonics; None without such an option."""
+        """The highest SH degree of the backbone; None if the backbone has no such option."""
         degree = self.backbone.model_dump().get("sh_degree")
         return degree if isinstance(degree, int) else None
 

@@ -1,4 +1,4 @@
-"""Findings of the planner: the evidence about one part of a run, and the settings that follow."""
+"""Findings of the planner: the evidence about a part of a run, and the settings that follow."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -7,33 +7,33 @@ from typing import Literal, TypeAlias
 
 from crossgrad_core.plugin import Decision, Json
 
-#: Name -> value of the evidence.
+#: Name of a piece of evidence -> its value.
 Figures: TypeAlias = Mapping[str, float]
 #: Name of a setting or of a component's option -> value.
 Settings: TypeAlias = Mapping[str, Json]
-#: Origin of a choice. `decided`: the evidence decided. `default`: the evidence is missing or not
-#: conclusive, so the default is used. `given`: the user set it.
+#: Origin of a choice: `decided` if the evidence decides, `default` if the evidence is missing or
+#: not conclusive, `given` if the user set the choice.
 Basis: TypeAlias = Literal["decided", "default", "given"]
-#: The saving of a choice is shown with this text if a run without a planner makes the same choice.
+#: This text replaces the saved cost if a run without the planner would make the same choice.
 NOTHING = "-"
 
 
 @dataclass(frozen=True)
 class Finding:
-    """The choice for one part of a run, with its evidence.
+    """The choice for a part of a run, with its evidence.
 
     Attributes:
-        part: The part of the run.
+        part: The part of the run, such as exposure.
         choice: The choice for the part.
         basis: The origin of the choice.
-        evidence: The evidence as text, with its value.
-        rule: The threshold.
+        evidence: The evidence as text.
+        rule: The threshold that the evidence is compared with.
         source: The source of the rule.
-        saved: The cost that the choice saves compared with a run that uses the part.
-        force: The option that sets another choice.
+        saved: The cost that the choice saves, compared with a run that uses the part.
+        force: The option with which the user makes another choice.
         figures: The values of the evidence.
         settings: The settings that change; empty if the choice is the default.
-        because: The reason for the change, in a few words.
+        because: The reason for the change in a few words.
     """
 
     part: str
@@ -56,13 +56,13 @@ class Finding:
         saved: str = NOTHING,
         figures: Figures | None = None,
     ) -> "Finding":
-        """Return the same choice with its evidence.
+        """Return the default choice with its evidence.
 
         Args:
             evidence: The evidence as text.
-            decided: True if the evidence decides; otherwise the default is kept.
+            decided: True if the evidence decides; False if the default is kept without a decision.
             saved: The cost that the choice saves.
-            figures: The values of the evidence.
+            figures: The values of the evidence, by name.
         """
         basis: Basis = "decided" if decided else "default"
         return replace(
@@ -72,13 +72,13 @@ class Finding:
     def changed(
         self, choice: str, settings: Settings, because: str, force: str, saved: str = NOTHING
     ) -> "Finding":
-        """Return a finding with another choice, decided by the same evidence.
+        """Return the finding with another choice that the same evidence decides.
 
         Args:
             choice: The choice for the part.
             settings: The settings that change.
-            because: The reason, in a few words.
-            force: The option that sets another choice.
+            because: The reason in a few words.
+            force: The option with which the user makes another choice.
             saved: The cost that the choice saves.
         """
         return replace(
@@ -93,7 +93,7 @@ class Finding:
 
     @property
     def decisions(self) -> list[Decision]:
-        """One row for each setting that changes; the terminal reports the first row."""
+        """One decision for each setting that changes; the terminal shows the first one."""
         return [
             Decision(name, value, self.because, self.evidence, "" if row else self.force)
             for row, (name, value) in enumerate(self.settings.items())
@@ -120,7 +120,7 @@ class Finding:
 
 
 def given(part: str, choice: object, force: str) -> Finding:
-    """Return the choice of the user, which applies without evidence from the scene."""
+    """Return the finding for a choice of the user, which needs no evidence."""
     return Finding(
         part, str(choice), "given", "set by you", "your own setting has priority", "you", force
     )

@@ -1,4 +1,4 @@
-"""Decisions about camera modes, pairs of views, views per step, and the operator."""
+"""Decisions about modes of cameras, pairs of views, views per step, and the operator."""
 
 from dataclasses import replace
 from math import isfinite, isnan
@@ -13,19 +13,19 @@ from crossgrad_plugins.planner.modes import FEWEST, LEAST_RATIO, LEAST_SHARE, ON
 if TYPE_CHECKING:
     from crossgrad_plugins.planner.probe import Probe
 
-#: Minimum sigma_b^2 / sigma_w^2 for which pairs are used. Pairs remove this share of a step's
-#: gradient variance.
+#: Minimum ratio sigma_b^2 / sigma_w^2 (variance between groups / within groups) for pairs of views.
+#: Pairs reduce the gradient variance of a step by about this share.
 LEAST_RHO: Final = 0.1
-#: Minimum share of views in the smaller mode for which pairs are used. Pairs weight both modes
-#: equally. With a smaller share, training would optimize another objective.
+#: Minimum share of the views in the smaller mode for pairs of views. Pairs give both modes equal
+#: weights. With a smaller share, the training objective would change too much.
 EVEN: Final = 0.4
-#: Expected share of conflicts if gradients have independent directions.
+#: Expected share of conflicting pairs if gradients have independent directions.
 CHANCE: Final = 0.5
 
 #: Number of groups of a sampler that draws near and far views.
 _BOTH: Final = 2
 _TWO_VIEWS: Final = "docs/results/two-views.md"
-#: Rows of docs/results/two-views.md and docs/results/paper.md.
+#: Names of rows in docs/results/two-views.md and docs/results/paper.md.
 _TWO_AGAINST_ONE: Final = (
     "two views minus one over our scenes, both drawn in epochs: -0.22 dB (-0.33 to -0.10 dB; n = "
     "12) at equal seconds, different; -0.01 dB (-0.11 to +0.09 dB; n = 12) at equal views, open, "
@@ -36,7 +36,7 @@ _NOT_KNOWN: Final = "not known; --probe SECONDS measures it"
 
 
 def modes(evidence: Evidence) -> Finding:
-    """Report how many modes the distances of the cameras have."""
+    """Report the number of modes of the camera distances."""
     camera_modes = evidence.modes
     rule = (
         f"two: distances or heights that Otsu's cut separates better than the best of {ONE_OF} "
@@ -63,7 +63,7 @@ def modes(evidence: Evidence) -> Finding:
 
 
 def pairs(evidence: Evidence) -> Finding:
-    """Decide whether steps use pairs of near and far views."""
+    """Decide if steps use pairs of near and far views."""
     config, camera_modes = evidence.config, evidence.modes
     part, configured = "pairs of views", config.sampler.name
     if evidence.is_given("sampler", "grouping"):
@@ -85,7 +85,7 @@ def pairs(evidence: Evidence) -> Finding:
 
 
 def _pairs_of_two_modes(evidence: Evidence, plain: Finding) -> Finding:
-    """Decide by the probe whether pairs of views are worth their cost."""
+    """Decide by the probe if pairs of views are worth their cost."""
     probe = evidence.probe
     if probe is None:
         return plain.found(f"two modes; sigma_b^2 / sigma_w^2 is {_NOT_KNOWN}")
@@ -120,13 +120,13 @@ def _pairs_of_two_modes(evidence: Evidence, plain: Finding) -> Finding:
 
 
 def views_of_steps(evidence: Evidence) -> ViewsPerStepSpec:
-    """Return the number of views per step, including the decision on pairs."""
+    """Return the number of views per step after the decision about pairs."""
     planned = "sampler" in pairs(evidence).settings and not evidence.is_given("views_per_step")
     return ViewsPerStepSpec((2,)) if planned else evidence.view_plan
 
 
 def _draws_pairs(evidence: Evidence) -> bool:
-    """Return True if steps have near and far views, by the plan or by the user's sampler."""
+    """Return True if each step has near and far views, by the plan or by the user's sampler."""
     if "sampler" in pairs(evidence).settings:
         return True
     return evidence.sampler.groups == _BOTH and _even(evidence.view_plan)
@@ -137,13 +137,13 @@ def _even(views: ViewsPerStepSpec) -> bool:
 
 
 def settings_of(grouping: ComponentChoice) -> dict[str, str]:
-    """Return a grouping as settings of a run."""
+    """Return the grouping as settings of a run."""
     options = {f"grouping.{name}": str(value) for name, value in grouping.options.items()}
     return {"grouping": grouping.name, **options}
 
 
 def _without_interval(probe: "Probe") -> str:
-    """Return the reason why sigma_b^2 / sigma_w^2 has no interval that could decide."""
+    """Return the reason why sigma_b^2 / sigma_w^2 has no interval for a decision."""
     if probe.rho < 0.0 and isnan(probe.rho_low):
         return f"sigma_b^2 / sigma_w^2 {probe.rho:.3f}, 95 % interval none, the estimate is below 0"
     return "no variance"
@@ -177,7 +177,7 @@ def views_per_step(evidence: Evidence) -> Finding:
 
 
 def operator(evidence: Evidence) -> Finding:
-    """Decide whether gradients are stored separately per view, and how they are combined."""
+    """Decide if gradients are stored per view, and how they are combined."""
     part = "operator"
     configured = "+".join(link.name for link in evidence.config.operators)
     if evidence.is_given("operator"):

@@ -1,4 +1,4 @@
-"""The decision on the length of a run."""
+"""The decision about the length of a run."""
 
 from typing import Final
 
@@ -8,14 +8,14 @@ from crossgrad_plugins.planner.finding import Finding, given
 from crossgrad_plugins.planner.grouping import views_of_steps
 
 _EXACTLY: Final = "--steps N or --max-views N"
-#: Number of views per training photo, and minimum number of all views. More views than both values
-#: gain little.
+#: Number of views per training photo, and minimum total number of views. Runs with more views than
+#: both numbers improve little.
 PASSES: Final = 100
 FEWEST_VIEWS: Final = 1_000
 
 
 def most_views(evidence: Evidence) -> int:
-    """Return the number of views beyond which further views improve the result little."""
+    """Return the number of views after which further views improve the result little."""
     return max(FEWEST_VIEWS, PASSES * len(evidence.scene.train_views))
 
 

@@ -1,4 +1,4 @@
-"""The modes of the cameras: one or two, and the ratio of their distances."""
+"""The modes of the cameras: one or two clusters of distances, and the ratio of their distances."""
 
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -12,23 +12,23 @@ from crossgrad_core.plugin import Scene, bimodality, footprint_of
 from crossgrad_plugins.groupings.heights import altitudes, upward
 from crossgrad_plugins.groupings.split import log_distances, otsu_separability, otsu_threshold
 
-#: If the ratio of the distances of two modes is smaller than this, both modes show the scene at
-#: nearly the same size.
+#: If the distances of two modes have a smaller ratio, both modes show the scene at nearly equal
+#: sizes.
 LEAST_RATIO: Final = 1.5
 #: Minimum number of views to detect two modes.
 FEWEST: Final = 10
-#: Minimum share of views in the smaller mode. A smaller group is treated as outliers.
+#: Minimum share of the views in the smaller mode. A smaller group counts as outliers.
 LEAST_SHARE: Final = 0.1
-#: About one of this many samples from a uniform distribution separates as well as two modes do.
+#: Two modes must separate better than all but one of this many samples from a uniform distribution.
 ONE_OF: Final = 100
-#: The kind of distance that is used if views show SfM points.
+#: Name of the distance that is used if views show SfM points.
 DEPTH: Final = "depth over focal length"
 FROM_THE_MEAN: Final = "distance from the mean camera"
 HEIGHT: Final = "height"
-#: Quantity -> the grouping that splits views by it.
+#: Quantity -> the grouping that divides views by this quantity.
 _GROUPINGS: Final = {DEPTH: "footprint", FROM_THE_MEAN: "radial", HEIGHT: "altitude"}
-#: Number of samples from a uniform distribution, and their maximum size. Larger samples separate no
-#: better.
+#: Number of samples from a uniform distribution, and their maximum size. Even larger samples do not
+#: separate better.
 _TRIALS, _LARGEST = 1000, 1000
 #: Largest number whose exponential is finite.
 _MOST: Final = 700.0
@@ -38,15 +38,15 @@ _Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Cut:
-    """The split of the views into two groups by one quantity, at Otsu's threshold.
+    """The division of the views into two groups by one quantity, at Otsu's threshold.
 
     Attributes:
         quantity: Name of the quantity.
-        separability: Share of the quantity's variance that is between both sides.
-        usual: The separability of the best of `ONE_OF` evenly spread samples.
-        share: Share of the views on the smaller side.
-        ratio: Far over near: the ratio of the median distances of both sides; 1 if there is one
-            side.
+        separability: Share of the quantity's variance that is between the two groups.
+        usual: Separability of the best of `ONE_OF` samples from a uniform distribution.
+        share: Share of the views in the smaller group.
+        ratio: Median distance of the far group divided by the median distance of the near group; 1
+            if there is only one group.
     """
 
     quantity: str
@@ -57,13 +57,13 @@ class Cut:
 
     @property
     def two(self) -> bool:
-        """True if both sides are modes that show the scene at different sizes."""
+        """True if both groups are modes, and show the scene at different sizes."""
         clean = self.separability > self.usual and self.share >= LEAST_SHARE
         return clean and self.ratio >= LEAST_RATIO
 
     @property
     def grouping(self) -> ComponentChoice:
-        """The grouping that splits the views at this threshold."""
+        """The grouping that divides the views at this threshold."""
         return ComponentChoice.model_validate({"name": _GROUPINGS[self.quantity], "cut": "otsu"})
 
 
@@ -74,7 +74,7 @@ class Modes:
     Attributes:
         quantity: The kind of distance.
         logs: [V] logarithms of the distances, for the views that have a distance.
-        heights: [V] heights of the same cameras, local units.
+        heights: [V] heights of the cameras with a distance, local units.
     """
 
     quantity: str
@@ -83,15 +83,15 @@ class Modes:
 
     @cached_property
     def bimodality(self) -> float:
-        """Sarle's coefficient of the distances, in the form for decisions; NaN if undefined."""
+        """Sarle's bimodality coefficient of the distances in its robust form; NaN if undefined."""
         return bimodality(self.logs).deciding
 
     @cached_property
     def cut(self) -> Cut:
-        """The split of the views by distance or by height.
+        """The division of the views by distance or by height.
 
-        If both make two modes, the split with the better separability is used; if neither does, the
-        split by distance.
+        If both quantities give two modes, the one with better separability is used. If none does,
+        the distance is used.
         """
         cuts = (self._by(self.quantity, self.logs), self._by(HEIGHT, self.heights))
         modes = [cut for cut in cuts if cut.two]
@@ -99,7 +99,7 @@ class Modes:
 
     @cached_property
     def spread(self) -> float:
-        """The ratio of the 95th to the 5th percentile of the distances; 1 without distances."""
+        """The 95th percentile of the distances divided by the 5th; 1 without distances."""
         if not len(self.logs):
             return 1.0
         low, high = np.percentile(self.logs, [5.0, 95.0])
@@ -107,12 +107,12 @@ class Modes:
 
     @property
     def two(self) -> bool:
-        """True if there are two modes that show the scene at different sizes."""
+        """True if there are two modes, which show the scene at different sizes."""
         return self.enough and self.cut.two
 
     @property
     def enough(self) -> bool:
-        """True if there are enough views to distinguish two modes from one mode."""
+        """True if there are enough views to distinguish two modes from one."""
         return len(self.logs) >= FEWEST
 
     @property
@@ -135,8 +135,8 @@ class Modes:
 def modes_of(scene: Scene) -> Modes:
     """Return the modes of the training views.
 
-    The distance of a view is the median depth of its SfM points divided by its focal length. If
-    fewer than half of the views show points, the distance from the mean camera is used instead.
+    The distance of a view is the median depth of its SfM points divided by the focal length. If
+    fewer than half of the views show points, the distance from the mean camera is used.
     """
     views = scene.train_views
     if not views:
@@ -154,7 +154,7 @@ def modes_of(scene: Scene) -> Modes:
 
 @cache
 def _usual(views: int) -> float:
-    """Return the separability of the best of `ONE_OF` evenly spread samples of `views` views."""
+    """Return the separability of the best of `ONE_OF` uniform samples of `views` views."""
     samples = np.random.default_rng(0).uniform(size=(_TRIALS, views))
     return float(np.quantile(otsu_separability(samples), 1.0 - 1.0 / ONE_OF))
 

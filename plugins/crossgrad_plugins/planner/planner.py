@@ -1,4 +1,4 @@
-"""All findings about a scene, and the settings of a run that follow from them."""
+"""All findings about a scene, and the settings of a run that follow from the findings."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from crossgrad_plugins.planner import appearance, data, grouping, length, view_s
 from crossgrad_plugins.planner.evidence import Evidence
 from crossgrad_plugins.planner.finding import Finding, Settings
 
-#: The functions that decide each part of a run, in the order of the table.
+#: The functions that make the decisions, in the order of the table.
 PARTS: Final[tuple[Callable[[Evidence], Finding], ...]] = (
     *(grouping.modes, grouping.pairs, view_schedule.view_schedule),
     *(grouping.views_per_step, grouping.operator),
@@ -22,12 +22,12 @@ PARTS: Final[tuple[Callable[[Evidence], Finding], ...]] = (
 
 @dataclass(frozen=True)
 class Plan:
-    """The findings about all parts of a run on a scene.
+    """The findings about all parts of a run.
 
     Attributes:
         scene: Name of the scene.
         findings: One finding for each part.
-        seconds: Seconds that the plan took.
+        seconds: Time that the planner took, in seconds.
     """
 
     scene: str
@@ -36,12 +36,12 @@ class Plan:
 
     @property
     def decisions(self) -> list[Decision]:
-        """The decisions on settings that change."""
+        """The decisions that change settings."""
         return [row for finding in self.findings for row in finding.decisions]
 
     @property
     def settings(self) -> Settings:
-        """The settings that change, with their values."""
+        """The changed settings with their values."""
         return {row.setting: row.value for row in self.decisions}
 
     def of_part(self, part: str) -> Finding:
@@ -49,11 +49,11 @@ class Plan:
         return next(finding for finding in self.findings if finding.part == part)
 
     def applied_to(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a run's settings in their long form, with the planned changes."""
+        """Return the settings of a run in their long form, with the planned changes."""
         decided, seconds = dict(self.settings), settings.get("seconds")
         if "max_views" in decided and seconds is not None:
-            # Merge the settings in layers. A layer with a length replaces the lengths of earlier
-            # layers.
+            # Merge the settings one after the other. Settings that give a length replace an earlier
+            # length.
             decided["seconds"] = seconds
         return layered([settings, decided])
 
@@ -68,12 +68,12 @@ class Plan:
 
 
 def plan_of(config: RunConfig, scene: Scene, probe_seconds: float | None = None) -> Plan:
-    """Plan a run on a scene; settings of the user are kept.
+    """Plan a run on a scene; the user's settings are kept.
 
     Args:
-        config: The configuration, with only the settings of the user.
+        config: The configuration with only the user's settings.
         scene: The scene of the run.
-        probe_seconds: Training seconds of a probe; None for no probe.
+        probe_seconds: Training time of a probe in seconds; None for no probe.
 
     Raises:
         UserError: A photo cannot be decoded.
@@ -85,7 +85,7 @@ def plan_of(config: RunConfig, scene: Scene, probe_seconds: float | None = None)
 
 
 def planned(config: RunConfig, scene: Scene) -> list[Decision]:
-    """Return the decisions about settings that follow from the scene; used by `--plan auto`.
+    """Return the decisions that follow from the scene, for `--plan auto`.
 
     Raises:
         UserError: A photo cannot be decoded.

@@ -1,4 +1,4 @@
-"""A short training run that measures gradients, which cameras and photos do not show."""
+"""A short training run that measures gradients, because cameras and photos do not show them."""
 
 from dataclasses import dataclass
 from math import nan, sqrt
@@ -14,25 +14,28 @@ from crossgrad_core.commands import (
 from crossgrad_plugins.diagnostics.app import Options, diagnose_scene
 from crossgrad_plugins.diagnostics.table import ALL, Row, rows_of
 
-#: Gradients are measured in Adam's metric, because the optimizer is Adam.
+#: Gradients are measured in Adam's metric, because the optimizer divides them in this way.
 _METRIC: Final = "adam"
-#: Half of the width of a 95 % interval, in standard errors.
+#: Half the width of a 95 % interval, in standard errors.
 _WIDE: Final = 1.96
 
 
 @dataclass(frozen=True)
 class Probe:
-    """The gradients of single views at the end of a short run, in Adam's metric over all blocks.
+    """Statistics of the gradients of single views after a short run.
+
+    Gradients are measured in Adam's metric, over all blocks.
 
     Attributes:
-        rho: sigma_b^2 / sigma_w^2, between and within near and far views.
+        rho: sigma_b^2 / sigma_w^2, the gradient variance between near and far views divided by the
+            variance within them.
         rho_low: Lower end of the 95 % interval of rho.
         rho_high: Upper end of the 95 % interval of rho.
-        noise_scale: Number of views that a step could use.
-        conflict: Share of the near-far pairs whose gradients conflict.
-        conflict_low: Lower end of the 95 % interval of conflict; the number of views of the smaller
-            group counts as the number of independent samples.
-        problem: Reason why there are no values; empty if there are values.
+        noise_scale: Number of views per step up to which further views reduce noise.
+        conflict: Share of pairs of a near and a far view whose gradients conflict.
+        conflict_low: Lower end of the 95 % interval of `conflict`, which assumes one independent
+            sample per view of the smaller group.
+        problem: Reason why there are no values, or an empty text.
     """
 
     rho: float = nan
@@ -45,11 +48,11 @@ class Probe:
 
 
 def probed(config: RunConfig, seconds: float, grouping: ComponentChoice) -> Probe:
-    """Train a vanilla run for some seconds, and return its measurements.
+    """Train a vanilla run (one view per step) for some seconds, and return its measurements.
 
     Args:
-        config: The configuration, with a scene; components are replaced.
-        seconds: Training seconds.
+        config: The configuration with a scene; its components are replaced.
+        seconds: Training time in seconds.
         grouping: The grouping into near and far views.
     """
     Progress().tell(f"training for {seconds:g} seconds to measure gradients")

@@ -1,4 +1,4 @@
-"""The dependence of the brightness of SfM points on the viewing direction."""
+"""How much the brightness of SfM points depends on the viewing direction."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,15 +11,15 @@ from crossgrad_core.plugin import Scene
 from crossgrad_plugins.exposures.tracks.gains import fitted
 from crossgrad_plugins.exposures.tracks.observations import Observations, observations_of
 
-#: Minimum number of observations of a track (twice the number of coefficients of degree 1). Minimum
-#: radius, in degrees, of the cone of its viewing directions.
+#: Minimum number of observations of a track: twice the number of coefficients of degree 1. Minimum
+#: radius, in degrees, of the cone that contains the track's viewing directions.
 LEAST_OBSERVATIONS: Final = 8
 LEAST_RADIUS: Final = 10.0
 #: Minimum number of tracks for a useful interval, and maximum number of tracks that are used.
 FEWEST_TRACKS: Final = 100
 _MOST_TRACKS: Final = 3_000
-#: Regularization of the coefficients of degree 1, relative to the number of observations, because
-#: the viewing directions in a narrow cone are nearly equal.
+#: Regularization of the coefficients of degree 1, relative to the number of observations. It is
+#: needed because directions in a narrow cone are nearly equal.
 _RIDGE: Final = 0.01
 _DRAWS: Final = 400
 
@@ -28,14 +28,16 @@ _Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ViewDependence:
-    """The share of the brightness of tracks that degree 1 explains, after exposure is removed.
+    """How much of the brightness of tracks a view dependence of degree 1 explains.
+
+    Differences in exposure are removed before.
 
     Attributes:
-        tracks: Number of tracks that were seen from enough directions.
-        share: Share of the variance of a left-out observation that degree 1 explains; negative if
-            degree 1 predicts worse than the mean, NaN without tracks.
-        low: Lower end of the 95 % interval of the share, with tracks resampled.
-        high: Upper end of the 95 % interval of the share.
+        tracks: Number of tracks that were observed from enough directions.
+        share: Share of the variance of left-out observations that degree 1 explains. It is negative
+            if degree 1 predicts worse than the mean, and NaN without tracks.
+        low: Lower end of the 95 % interval of `share`, by a bootstrap over tracks.
+        high: Upper end of the 95 % interval of `share`.
     """
 
     tracks: int
@@ -47,9 +49,9 @@ class ViewDependence:
 def view_dependence(scene: Scene) -> ViewDependence:
     """Measure the view dependence of the tracks of the training photos.
 
-    For each track that is seen from enough directions, every observation is predicted from the
-    other observations: by their mean, and by a plane over the directions. Differences in exposure
-    are removed first.
+    Every observation of a track is predicted from the track's other observations in two forms: by
+    their mean, and by a linear function of the direction. Differences in exposure are removed
+    before.
 
     Raises:
         UserError: A photo cannot be decoded.
@@ -70,7 +72,7 @@ def view_dependence(scene: Scene) -> ViewDependence:
 
 
 def _tracks(observations: Observations) -> Iterator[NDArray[np.int64]]:
-    """Yield the observations [T, n] of the tracks of each sufficient length n, longest first."""
+    """Yield the observations [T, n] of tracks with n observations, for each sufficient n."""
     order = np.argsort(observations.points, kind="stable")
     lengths = np.bincount(observations.points)
     starts = np.cumsum(lengths) - lengths
@@ -79,11 +81,11 @@ def _tracks(observations: Observations) -> Iterator[NDArray[np.int64]]:
 
 
 def _errors(stops: _Floats, directions: _Floats) -> _Floats:
-    """Return the mean squared errors [T', 2] of both predictions for each wide enough track.
+    """Return [T', 2] mean squared errors of both predictions for tracks with a wide enough cone.
 
     Args:
-        stops: [T, n] brightness in stops.
-        directions: [T, n, 3] unit vectors.
+        stops: [T, n] brightness of the observations, in stops.
+        directions: [T, n, 3] unit viewing directions.
     """
     count = stops.shape[1]
     mean = directions.mean(axis=1, keepdims=True)
@@ -99,7 +101,7 @@ def _errors(stops: _Floats, directions: _Floats) -> _Floats:
 
 
 def _share(errors: _Floats) -> ViewDependence:
-    """Return the share with its interval, from the errors [T, 2] of the tracks."""
+    """Return the explained share with its interval, from the errors [T, 2] of the tracks."""
     count = len(errors)
     if not errors[:, 0].sum() > 0.0:
         return ViewDependence(count, float("nan"), float("nan"), float("nan"))

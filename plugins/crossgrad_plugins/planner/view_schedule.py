@@ -13,17 +13,17 @@ from crossgrad_plugins.planner.finding import Finding, given
 from crossgrad_plugins.planner.grouping import EVEN, pairs, settings_of
 from crossgrad_plugins.planner.length import most_views
 
-#: Number of far views per near view in the first part of a run. The sampler `horizon` defines this
-#: part.
+#: Number of far views per near view in the first stage of a run. The sampler `horizon` implements
+#: this stage.
 FAR_TO_NEAR: Final = 5
-#: Maximum angle of far views and minimum angle of near views, in degrees from the mean direction of
-#: the far views.
+#: Maximum median angle of far views and minimum median angle of near views to the mean direction of
+#: the far views, in degrees.
 WITHIN, BEYOND = 45.0, 60.0
 
 
 @dataclass(frozen=True)
 class Directions:
-    """Median angles to the mean viewing direction of the far views.
+    """Median angles between viewing directions and the mean direction of the far views.
 
     Attributes:
         far: Median angle of the far views, degrees.
@@ -35,7 +35,7 @@ class Directions:
 
     @property
     def differ(self) -> bool:
-        """True if far views look in one direction and near views in another direction."""
+        """True if far views agree in their direction and near views look elsewhere."""
         return self.far <= WITHIN and self.near >= BEYOND
 
 
@@ -52,7 +52,7 @@ def directions(scene: Scene, grouping: ComponentChoice) -> Directions:
 
 
 def view_schedule(evidence: Evidence) -> Finding:
-    """Decide whether far views are drawn more often than near views at first."""
+    """Decide if far views are drawn more often than near views in the first stage."""
     part, configured = "view schedule", evidence.config.sampler.name
     if evidence.is_given("sampler", "grouping"):
         return given(part, configured, "--sampler NAME")
@@ -75,7 +75,7 @@ def view_schedule(evidence: Evidence) -> Finding:
 
 
 def _schedule_of_two_modes(evidence: Evidence, plain: Finding) -> Finding:
-    """Use the viewing directions to decide whether far views are drawn more often."""
+    """Decide by the viewing directions if far views are drawn more often."""
     if "sampler" in pairs(evidence).settings:
         return plain.found("a step has a near and a far view", decided=True)
     cut = evidence.modes.cut
@@ -101,7 +101,7 @@ def _schedule_of_two_modes(evidence: Evidence, plain: Finding) -> Finding:
 
 
 def _in_short_run(evidence: Evidence) -> bool:
-    """Return True if the run is short, with the length from the plan."""
+    """Return True if the run is short; the planned length is used."""
     config = evidence.config
     if config.steps is config.seconds is config.max_views is None:
         config = config.model_copy(update={"max_views": most_views(evidence)})

@@ -1,4 +1,4 @@
-"""Stages that make a scene from photos. Each stage continues after an interruption."""
+"""The stages that make a scene from photos. Each stage can continue after an interruption."""
 
 import io
 import json
@@ -40,23 +40,23 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-#: Okabe and Ito's colours, distinguishable with any colour vision.
+#: The palette of Okabe and Ito, which can be distinguished with any colour vision.
 _COLORS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A5C00")
 _MOST_POINTS, _MOST_LINKS = 20_000, 4_000
-#: Points beyond these percentiles are not drawn.
+#: Points outside these percentiles of the coordinates are not drawn.
 _INNER: Final = (1.0, 99.0)
 _MARGIN: Final = 0.15
-#: Titles of both panels for a scene that is not georeferenced. The vertical of such a scene is
-#: unknown.
+#: Titles of the two panels if the scene is not georeferenced. The vertical direction is unknown in
+#: this case.
 _TITLES: Final = ("first and second axis of the cameras", "first and third axis of the cameras")
 
 
 def draw(report: Report, model: "pycolmap.Reconstruction") -> bytes:
-    """Return the picture of the report as PNG.
+    """Return the figure of the report as PNG.
 
     Args:
         report: The facts about the scene.
-        model: The scene's model.
+        model: The model of the scene.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -92,7 +92,7 @@ def _panel(
     centers: Mapping[str, NDArray[np.float64]],
     shown: tuple[int, int],
 ) -> None:
-    """Draw points, links and cameras along two of the axes."""
+    """Draw points, links and cameras in the plane of two axes."""
     from matplotlib.collections import LineCollection
 
     across, up = shown
@@ -132,7 +132,7 @@ def _axes(centers: NDArray[np.float64]) -> NDArray[np.float64]:
 
 T = TypeVar("T")
 _PAUSE = 5.0
-#: Camera model of 360-degree photos.
+#: Camera models of 360-degree photos.
 _ALL_AROUND = "EQUIRECTANGULAR"
 
 
@@ -140,7 +140,7 @@ def prepare_scene(photos: Path, scene: Path, settings: Settings, threads: int | 
     """Make a scene from a folder of photos, and print a summary.
 
     Raises:
-        UserError: For the same reasons as `prepared`.
+        UserError: The same conditions as in `prepared`.
     """
     report = prepared(photos, scene, settings, threads)
     for line in summary_lines(report):
@@ -161,15 +161,15 @@ def prepared(photos: Path, scene: Path, settings: Settings, threads: int | None 
         threads: CPU threads, or None for all cores.
 
     Raises:
-        UserError: There are too few photos, the scene folder has other contents, no photos match,
+        UserError: There are too few photos, the scene folder contains other files, no photos match,
             or the disk is full.
     """
     layout = Layout(scene)
     check_ours(layout, photos)
     _check_lens(settings.lens)
-    # If the scene is already complete, its photos are no longer needed.
+    # If the scene is complete, its photos are no longer needed.
     plan = _planned(photos, settings, fewest=0 if layout.is_ready else 2)
-    # Write nothing here, because other processes may read the folder and the disk may be read-only.
+    # Write nothing here, because other processes may read the folder, or the disk may be read-only.
     if layout.is_ready:
         return _carried_out(layout, agreed(layout, plan), 1)
     matching.check_gps(plan)
@@ -182,16 +182,16 @@ def prepared(photos: Path, scene: Path, settings: Settings, threads: int | None 
 
 
 def made_or_ready(photos: Path, scene: Path, settings: Settings) -> list[str]:
-    """Make a scene from photos.
+    """Make a scene from photos, unless the scene is complete.
 
-    If the scene is complete, its photos and working folder may be missing.
+    The photos and the working folder of a complete scene may be missing.
 
     Returns:
         Messages about the scene.
 
     Raises:
-        UserError: For the same reasons as `prepared`.
-        UserError: As `prepared`.
+        UserError: The same conditions as in `prepared`.
+        UserError: The same conditions as in `prepared`.
     """
     layout, why = Layout(scene), ""
     if layout.is_ready and not layout.is_whole:
@@ -238,7 +238,7 @@ def _check_lens(name: str) -> None:
 
 
 def _planned(photos: Path, settings: Settings, fewest: int) -> Plan:
-    """Return the plan, made from the settings and from the photos' files."""
+    """Return the plan from the settings and the photo files."""
     progress = Progress(_PAUSE)
 
     def tell(done: int, of: int) -> None:
@@ -271,7 +271,10 @@ def _timed(what: str, stage: Callable[[], T]) -> T:
 
 
 def _write_report(layout: Layout, report: Report) -> None:
-    """Write georef.json, the picture and the reports. report.json is last and marks completion."""
+    """Write georef.json, the figure and the reports.
+
+    The file report.json is written last, because it marks a complete scene.
+    """
     import pycolmap
 
     if report.result.georef is not None:

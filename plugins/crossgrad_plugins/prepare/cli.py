@@ -18,7 +18,7 @@ _CHOICES: Final[dict[str, tuple[str, ...]]] = {
 
 @dataclass(frozen=True)
 class Options:
-    """The options of the command."""
+    """Options of the command."""
 
     photos: Path = argument(
         "PHOTOS", "Folder of photos; put photos of different regimes into different folders."
@@ -83,9 +83,9 @@ class Options:
 def prepare(given: Options) -> None:
     """Estimate camera poses of photos and make a scene for training.
 
-    The command finds features, matches and poses, and writes undistorted photos. If photos have
-    GPS, it also georeferences the scene. A report (report.md, report.png) lists the photos in the
-    scene, the missing photos, and the reasons.
+    The command finds features, matches and poses, and writes undistorted photos. If photos have GPS
+    positions, the command also georeferences the scene. A report (report.md, report.png) lists the
+    photos in the scene, and the missing photos with reasons.
     """
     announce(quiet=True)
     for name in _CHOICES:

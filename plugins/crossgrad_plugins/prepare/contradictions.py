@@ -1,4 +1,4 @@
-"""Search for photos whose matches mostly contradict their pose in a model."""
+"""Search for photos whose matches contradict their poses in a model."""
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -15,23 +15,25 @@ if TYPE_CHECKING:
     import pycolmap
 
 #: A pair of photos counts if it has at least this many verified matches. COLMAP requires the same
-#: number for a pose. With fewer matches, most pairs of photos of repeated walls and pavements are
-#: wrong.
+#: number of matches for a pose. With fewer matches, most pairs of photos that show repeated walls
+#: or pavements are wrong.
 _MATCHES: Final = 30
-#: Maximum distance in pixels between a match and its epipolar line, as in verification. Two poses
-#: agree with a pair if at least this share of its matches is within this distance.
+#: Maximum distance in pixels between a match and its epipolar line, as in COLMAP's verification.
+#: Two poses agree with a pair of photos if at least this share of the pair's matches is within the
+#: distance.
 _PIXELS, _AGREEING = 4.0, 0.5
-#: A photo is misplaced if less than this share of its matches agrees, and if at least this many of
-#: its pairs with other photos disagree. One pair alone can be wrong.
+#: A photo is misplaced if two conditions hold: less than this share of its matches agrees, and at
+#: least this many of its pairs disagree. A single pair is not enough, because one pair can be
+#: wrong.
 _SHARE, _AGAINST = 1.0 / 3.0, 2
 
 
 @dataclass(frozen=True, eq=False)
 class Votes:
-    """The pairs of a model, each with a flag for agreement with the model's poses.
+    """The pairs of a model, with a flag for pairs that agree with the model's poses.
 
     Attributes:
-        photos: [P, 2] numbers of the two photos of each pair.
+        photos: [P, 2] numbers of the photos of each pair.
         matches: [P] number of verified matches.
         agrees: [P] True if most of the matches agree with the two poses.
     """
@@ -44,21 +46,21 @@ class Votes:
 def contradicted(
     model: "pycolmap.Reconstruction", database: Path, settled: Collection[int] = ()
 ) -> dict[int, tuple[int, int]]:
-    """Return the photos whose matches with other photos of the model contradict their pose.
+    """Return the photos whose matches with other photos contradict their poses.
 
-    Repeated structures in different places look alike. Pairs of such photos pass the verification
-    of two views, and may misplace a photo that is added early. Pairs with photos that are added
-    later show the error. The photo with the smallest share of agreeing matches is removed first,
-    and its matches no longer count for the other photos.
+    Repeated structures at different places look alike. Pairs of photos of such places pass COLMAP's
+    verification of two views. They can misplace a photo that is added early. Pairs with photos that
+    are added later show this error. The photo with the smallest share of agreeing matches is
+    removed first. Its matches then no longer count for other photos.
 
     Args:
-        model: The model.
+        model: The model after mapping.
         database: COLMAP's database with the verified matches.
-        settled: Photos for which no other pose has more agreeing matches. These photos are never
+        settled: Photos for which no other pose has more agreeing matches; these photos are never
             returned.
 
     Returns:
-        Number of each such photo -> its matches for and against the pose.
+        Number of each misplaced photo -> number of its matches for and against its pose.
     """
     votes, misplaced = _votes(model, database), dict[int, tuple[int, int]]()
     counts = _Counts(max(model.reg_image_ids(), default=0) + 1)
@@ -77,10 +79,10 @@ def contradicted(
 
 @dataclass(frozen=True)
 class _Counts:
-    """Sums over pairs for each photo.
+    """Sums over pairs of photos, for each photo.
 
     Attributes:
-        size: Largest number of a photo, plus one.
+        size: Largest number of a photo plus one.
     """
 
     size: int
@@ -88,7 +90,7 @@ class _Counts:
     def of(
         self, votes: Votes, which: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return the number of matches [size] and pairs [size] of each photo, over some pairs."""
+        """Return for each photo its number of matches [size] and of pairs [size]."""
         photos, matches = votes.photos[which].ravel(), np.repeat(votes.matches[which], 2)
         summed = np.bincount(photos, matches.astype(np.float64), minlength=self.size)
         return summed.astype(np.float64), np.bincount(photos, minlength=self.size).astype(np.int64)
@@ -110,9 +112,9 @@ def _votes(model: "pycolmap.Reconstruction", path: Path) -> Votes:
 def _judged(
     model: "pycolmap.Reconstruction", database: "pycolmap.Database"
 ) -> Iterator[tuple[int, int, int, int]]:
-    """Yield the numbers of both photos, all matches and the agreeing matches of each pair.
+    """Yield for each pair the numbers of both photos, of all matches and of agreeing matches.
 
-    Pairs are between photos of the model.
+    Only pairs of photos in the model are returned.
     """
     import pycolmap
 

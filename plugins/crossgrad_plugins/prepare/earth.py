@@ -14,29 +14,30 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-#: Half a turn in degrees of longitude.
+#: Half a turn around the Earth, in degrees of longitude.
 _HALF = 180.0
 #: EXIF orientation -> camera axis (x right, y down) that points to the top of the photo.
 _TOPS: Final = {3: (0.0, 1.0, 0.0), 4: (0.0, 1.0, 0.0), 5: (-1.0, 0.0, 0.0), 6: (-1.0, 0.0, 0.0),
                 7: (1.0, 0.0, 0.0), 8: (1.0, 0.0, 0.0)}  # fmt: skip
 _TOP: Final = (0.0, -1.0, 0.0)
 _STEPS: Final = 1440
-#: Limits for the root mean square of the sine of the tilt of level photos. The first value is the
-#: maximum at the best roll. The second value is the minimum difference between the best and the
-#: worst roll that determines the roll.
+#: Limits for the root mean square sine of the tilt angles of photos that should be level. The first
+#: value is the maximum at the best roll angle. The second value is the minimum difference between
+#: the best and the worst roll angle; with a smaller difference, the roll is unclear.
 _LEVEL, _TELLING = 0.15, 0.3
-#: Minimum mean amount by which the top of the photos points upwards or the photos look down.
+#: Minimum mean upward component of the photos' top directions, or downward component of their
+#: viewing directions.
 _UPRIGHT: Final = 0.3
 
 
 def origin_of(plan: Plan) -> Position | None:
-    """Return the median position of the photos, or None if no photo has GPS."""
+    """Return the median GPS position of the photos, or None if no photo has a position."""
     positions = [photo.position for photo in plan.located if photo.position is not None]
     if not positions:
         return None
     longitudes = [position.longitude for position in positions]
     if max(longitudes) - min(longitudes) > _HALF:
-        # If this is true, the photos are on both sides of the date line.
+        # The photos are on both sides of the date line.
         longitudes = [longitude % (2 * _HALF) for longitude in longitudes]
     east = median(longitudes)
     return Position(
@@ -71,7 +72,7 @@ def _to_local(positions: Sequence[Position], origin: Position) -> NDArray[np.flo
 
 
 def top_of(orientation: int) -> NDArray[np.float64]:
-    """Return the camera axis [3] that points to the top of a photo when it is displayed."""
+    """Return the camera axis [3] that points to the top of the displayed photo."""
     return np.array(_TOPS.get(orientation, _TOP))
 
 
@@ -85,9 +86,10 @@ def levelled(
 
     Args:
         model: The model.
-        similarity: From the model to metres east, north, up, correct except for the roll.
-        line: [3] a point of the line and [3] its direction, of length 1.
-        tops: Name -> [3] camera axis towards the top of the photo.
+        similarity: From the model to metres east, north and up; everything except its roll is
+            correct.
+        line: A point [3] and the unit direction [3] of the line.
+        tops: Name of a photo -> camera axis [3] towards the top of the photo.
     """
     import pycolmap
 
@@ -103,8 +105,8 @@ def levelled(
     if tilts.max() - tilts.min() < _TELLING or tilts.min() > _LEVEL:
         return None
     upright = (_heights(up, along, angles) - _heights(ahead, along, angles)).mean(axis=0)
-    # If the frame is rotated by half a turn, the photos are equally level. In one of the two
-    # positions, they are upside down.
+    # If the model is rolled by half a turn, the photos are level again. In one of these two
+    # positions, the photos are upside down.
     best = int(np.argmin(np.where(upright > _UPRIGHT, tilts, np.inf)))
     if upright[best] <= _UPRIGHT or tilts[best] > _LEVEL:
         return None
@@ -117,7 +119,7 @@ def levelled(
 def _heights(
     vectors: NDArray[np.float64], along: NDArray[np.float64], angles: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return z [N, A] of vectors [N, 3] rotated about an axis [3] by angles [A] (Rodrigues)."""
+    """Return z [N, A] of vectors [N, 3] rotated about an axis [3] by angles [A]."""
     kept = np.outer(vectors @ along, along)
     across = vectors - kept
     return np.asarray(

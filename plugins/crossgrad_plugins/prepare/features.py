@@ -18,27 +18,28 @@ from crossgrad_plugins.prepare.pycolmap_calls import JOURNAL, quiet, rows_of, wa
 if TYPE_CHECKING:
     import pycolmap
 
-#: Longest side in pixels of the reduced photos in which features are found (COLMAP's default).
+#: Longest side, in pixels, of the reduced photos in which features are searched (COLMAP's default).
 LONGEST: Final = 3200
-#: Number of bytes per pixel that SIFT needs, including its upscaling to twice the size (measured in
-#: docs/prepare.md). Number of bytes per pixel of the decoded file, in colour and grey. Maximum
-#: share of the free memory for all threads together.
+#: Three values for the memory of SIFT. Bytes per pixel, including the upscaling to twice the size
+#: (measured in docs/prepare.md). Bytes per pixel of the decoded file, in colour and in grey.
+#: Maximum share of the free memory for all threads together.
 _BYTES_PER_PIXEL, _BYTES_DECODED, _SHARE = 320, 4, 0.6
-#: Photos with fewer pixels than this yield few features. For them, SIFT also accepts fainter
-#: features and features along edges. The other two values are the contrast threshold and the ratio
-#: of curvatures (COLMAP's defaults: 0.0067 and 10).
+#: Photos with fewer pixels than the first value have few features. In these photos, SIFT also
+#: accepts fainter features and features along edges. The other values are the contrast threshold
+#: and the ratio of curvatures for these photos (COLMAP's defaults: 0.0067 and 10).
 _SMALL, _FAINT, _ALONG_EDGES = 1e6, 0.002, 20.0
 #: Number of bytes of a feature in the database, and number of stored features per requested
-#: feature. A feature with several orientations is stored several times.
+#: feature. The second number is above 1, because a feature with several orientations is stored
+#: several times.
 _BYTES_OF_FEATURE, _ORIENTATIONS = 152, 1.6
-#: Maximum number of photos of a camera that are tried until a photo can be read.
+#: Maximum number of photos of a camera that are tried until one of them can be read.
 _TRIED: Final = 5
 
 
 def found_features(layout: Layout, plan: Plan, threads: int) -> dict[str, int]:
-    """Find the features and return their number by photo name, 0 for an unreadable photo.
+    """Find the features; return their number by photo name, 0 for an unreadable photo.
 
-    Features are stored in the database. Photos whose features are already stored are skipped.
+    The features are stored in the database. Photos with stored features are skipped.
 
     Raises:
         UserError: The disk is full, or pycolmap failed.
@@ -70,7 +71,10 @@ def found_features(layout: Layout, plan: Plan, threads: int) -> dict[str, int]:
 
 
 def _room(layout: Layout, plan: Plan) -> int:
-    """Return the bytes that missing features need, because SQLite aborts on a full disk."""
+    """Return the free bytes that are needed for the missing features.
+
+    They are checked in advance, because SQLite aborts the process on a full disk.
+    """
     done = rows_of(layout.database, "descriptors") if layout.database.is_file() else 0
     bytes_per_photo = int(_ORIENTATIONS * plan.settings.max_features) * _BYTES_OF_FEATURE
     return max(0, len(plan.used) - done) * bytes_per_photo + JOURNAL
@@ -93,7 +97,7 @@ def _options(
 def _find(
     layout: Layout, plan: Plan, names: Sequence[str], options: "pycolmap.FeatureExtractionOptions"
 ) -> None:
-    """Find the features of these photos."""
+    """Find the features of some photos."""
     import pycolmap
 
     reading = pycolmap.ImageReaderOptions()
@@ -109,7 +113,7 @@ def _find(
 
 
 def _threads(photos: Sequence[Photo], longest: int, threads: int) -> int:
-    """Return the number of photos processed in parallel, limited by the free memory."""
+    """Return the number of photos that are processed in parallel, limited by the free memory."""
     need = max(
         _BYTES_PER_PIXEL * _pixels(photo, longest) + _BYTES_DECODED * photo.width * photo.height
         for photo in photos
@@ -124,7 +128,7 @@ def _pixels(photo: Photo, longest: int) -> float:
 
 
 def _make_database(layout: Layout, plan: Plan) -> None:
-    """Make the database with cameras, photos and their positions, but without features."""
+    """Make the database with cameras, photos and GPS positions, but without features."""
     import pycolmap
 
     scratch = layout.database.with_name(f".{layout.database.name}.tmp")
@@ -148,7 +152,7 @@ def _write_camera(
     photos: Sequence[Photo],
     positions: Mapping[str, NDArray[np.float64]],
 ) -> None:
-    """Write photos that share a calibration."""
+    """Write the photos that have a common calibration."""
     import pycolmap
 
     camera_id = database.write_camera(_camera(plan, photos))
@@ -169,7 +173,7 @@ def _write_camera(
 def _camera(plan: Plan, photos: Sequence[Photo]) -> "pycolmap.Camera":
     """Return the initial calibration.
 
-    The focal length comes from EXIF, or is 1.2 x the longer side.
+    The focal length comes from EXIF; without EXIF, it is 1.2 times the longer side.
     """
     import pycolmap
 
@@ -181,7 +185,7 @@ def _camera(plan: Plan, photos: Sequence[Photo]) -> "pycolmap.Camera":
         except (
             RuntimeError,
             ValueError,
-        ):  # Pillow can read the photo but pycolmap cannot, so the photo has no features.
+        ):  # Pillow can read this photo but pycolmap cannot, so the photo gets no features.
             continue
     width, height = photos[0].width, photos[0].height
     focal = reading.default_focal_length_factor * max(width, height)
@@ -191,7 +195,7 @@ def _camera(plan: Plan, photos: Sequence[Photo]) -> "pycolmap.Camera":
 def _write_position(
     database: "pycolmap.Database", data: "pycolmap.data_t", position: NDArray[np.float64]
 ) -> None:
-    """Write a position in the local frame (east, north, up), because large numbers lose digits."""
+    """Write a position in local coordinates, because large numbers lose digits."""
     import pycolmap
 
     system = pycolmap.PosePriorCoordinateSystem.CARTESIAN

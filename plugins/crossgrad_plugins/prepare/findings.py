@@ -1,4 +1,4 @@
-"""Findings of a report: joins between folders, missing photos and lost photos."""
+"""Findings of a report: matches between folders, photos without a pose, gaps in the scene."""
 
 import math
 from collections import Counter, defaultdict
@@ -11,12 +11,12 @@ from typing import Final
 from crossgrad_plugins.prepare.matching import Link
 from crossgrad_plugins.prepare.plan import Photo, Plan
 
-#: A photo is reported in three cases: it has fewer features than the first number, fewer features
-#: than this share of the median, or less than this share of the median sharpness.
+#: A photo is reported if it has fewer features than the first number, fewer than the second value
+#: times the median, or less than the third value times the median sharpness.
 _FEW, _LOW_SHARE, _BLURRED_SHARE = 200, 0.25, 0.2
 _DARK, _BRIGHT = 30.0, 235.0
-#: Maximum factor between the heights of successive photos on a ramp between two regimes. SIFT
-#: matches photos well if their scales differ by less than a factor of 1.5 (docs/prepare.md).
+#: Maximum ratio of the heights of consecutive photos that connect two regimes. SIFT matches photos
+#: well if their scales differ by a factor below 1.5 (docs/prepare.md).
 _RUNG: Final = 1.4
 _MOST_RUNGS: Final = 12
 
@@ -28,7 +28,7 @@ class Lost:
     Attributes:
         name: The photo's name.
         features: Number of features of the photo.
-        links: Number of photos with which it has verified matches.
+        links: Number of other photos with which the photo has verified matches.
         why: Possible reason for the missing pose.
     """
 
@@ -43,10 +43,10 @@ class ModelJoin:
     """The matches between two folders, or within one folder.
 
     Attributes:
-        first: One folder.
-        second: The other folder, or the same folder for pairs within it.
+        first: Name of one folder.
+        second: Name of the other folder; for pairs within a folder, the same name.
         pairs: Number of photo pairs with verified matches.
-        matches: Number of verified matches of all these pairs.
+        matches: Number of verified matches in all these pairs.
     """
 
     first: str
@@ -57,14 +57,14 @@ class ModelJoin:
 
 @dataclass(frozen=True)
 class BridgeReport:
-    """A gap between two parts of the scene, which further photos can close.
+    """A gap between two parts of the scene, which additional photos can close.
 
     Attributes:
         first: Folders of the larger part.
-        second: Folders of the part that is not joined to the larger part.
+        second: Folders of the part that is not connected with the larger part.
         photos: Number of photos of the second part.
-        pairs: Number of photo pairs with verified matches between the parts.
-        heights: Metres above ground of the lower and the higher part, or None if unknown.
+        pairs: Number of pairs with verified matches between the two parts.
+        heights: Height of the lower and of the higher part above ground, m; None if unknown.
         advice: A sentence that tells the user what to do.
     """
 
@@ -88,9 +88,9 @@ def lost_photos(
     Args:
         plan: The plan.
         features: Name -> number of features.
-        links: Pairs with verified matches.
-        models: Photo names of each model, and True if the model is in the scene.
-        misplaced: Name of a photo that was taken out of a model -> its matches for and against its
+        links: Pairs of photos with verified matches.
+        models: Photo names of each model, and True if this model is in the scene.
+        misplaced: Name of a photo that was removed from a model -> its matches for and against its
             pose.
     """
     partners: Counter[str] = Counter()
@@ -121,7 +121,7 @@ def lost_photos(
 
 
 def _contradicted(agreeing: int, against: int) -> str:
-    """Return the reason why a photo was taken out of a model."""
+    """Return the reason why a photo was removed from a model."""
     return (
         f"its matches contradict each other: {agreeing} support its best position and "
         f"{against} contradict it (repeated walls, windows or pavements?)"
@@ -151,7 +151,7 @@ def _why(photo: Photo, features: int, partners: int, typical: tuple[float, float
 
 
 def joins_of(plan: Plan, links: Sequence[Link]) -> tuple[ModelJoin, ...]:
-    """Return the matches between all pairs of folders, including pairs without matches."""
+    """Return the matches for every pair of folders, also for pairs without matches."""
     folder = {photo.name: photo.folder for photo in plan.used}
     pairs: Counter[tuple[str, str]] = Counter()
     matches: Counter[tuple[str, str]] = Counter()
@@ -169,27 +169,28 @@ def bridges_of(
     parts: Sequence[frozenset[str]],
     heights: Mapping[str, float],
 ) -> tuple[BridgeReport, ...]:
-    """Return the gaps between the largest part of the scene and the other parts.
+    """Return the gaps between the largest part of the scene and each other part.
 
     Args:
         plan: The plan.
-        links: Pairs with verified matches.
-        parts: Photo names of each model, the largest first, and of folders that are in no model.
-        heights: Name -> metres above ground, if known.
+        links: Pairs of photos with verified matches.
+        parts: Photo names of each part, largest part first. A part is a model, or a folder that is
+            in no model.
+        heights: Name of a photo -> height above ground, m, if known.
     """
     if not parts:
         return ()
     main, grouped = parts[0], dict[str, set[str]]()
     for part in parts[1:]:
         if part - main:
-            # Suggest one bridge for all unconnected parts of a folder, because one bridge is
-            # enough.
+            # Suggest one bridge for all unconnected parts of a folder, because one bridge can
+            # connect them all.
             grouped.setdefault(_folders(plan, part - main), set()).update(part - main)
     return tuple(_bridge(plan, links, (main, frozenset(p)), heights) for p in grouped.values())
 
 
 def parts_of(plan: Plan, models: Sequence[frozenset[str]]) -> list[frozenset[str]]:
-    """Return the photos of each model, and the missing photos of mostly missing folders."""
+    """Return the photos of each model, and of each folder whose photos are mostly missing."""
     posed = frozenset().union(*models)
     missing: dict[str, set[str]] = defaultdict(set)
     sizes: Counter[str] = Counter(photo.folder for photo in plan.used)
@@ -228,14 +229,14 @@ def _middle(names: Iterable[str], heights: Mapping[str, float]) -> float | None:
 
 
 def _folders(plan: Plan, names: Iterable[str]) -> str:
-    """Return the folders of photos as text, folders with most photos first."""
+    """Return folder names as text; folders with most photos come first."""
     inside = set(names)
     counted = Counter(photo.folder for photo in plan.used if photo.name in inside)
     return " + ".join(folder or "photos outside of folders" for folder, _ in counted.most_common(3))
 
 
 def _advice(first: str, second: str, heights: tuple[float, float] | None) -> str:
-    """Return advice on photos that would join two parts."""
+    """Return advice about photos that would connect two parts."""
     if first == second:
         return f"{first}: the photos form separate parts; add photos that overlap with both parts"
     if heights is None:
@@ -257,6 +258,6 @@ def _advice(first: str, second: str, heights: tuple[float, float] | None) -> str
 
 
 def fallbacks(low: float, high: float) -> list[float]:
-    """Return heights from the lower to the higher end, each a constant factor above the last."""
+    """Return heights from the lower to the higher end with a constant ratio."""
     steps = min(_MOST_RUNGS, max(1, math.ceil(math.log(high / low) / math.log(_RUNG))))
     return [low * (high / low) ** (step / steps) for step in range(steps + 1)]

@@ -1,4 +1,4 @@
-"""Georegistration of models by GPS, and merging of models that only GPS joins."""
+"""Georegistration of models by GPS, and merging of models that are connected only by GPS."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,27 +15,28 @@ if TYPE_CHECKING:
 
 #: Minimum number of photos with GPS for a similarity.
 FEWEST: Final = 3
-#: Assumed GPS errors in metres, from a good receiver to a phone between houses. The first error in
-#: this list with which most photos agree is used.
+#: Possible GPS errors in metres, from a good receiver to a phone between houses. The smallest error
+#: with which most photos agree is used.
 _ERRORS: Final = (3.0, 10.0, 30.0)
 _AGREEING: Final = 0.6
-#: Photos must be this many GPS errors apart in the direction across their main direction. If the
-#: photos show the upward direction, a spread along the main direction is enough.
+#: The spread of the photos across their main direction must be at least this many GPS errors. If
+#: the photos show the upward direction, a spread along the main direction is enough.
 _SPREAD: Final = 3.0
-#: Cameras are on a line if their spread across it is below this share of the spread along it.
+#: Cameras are on a line if their spread across the line is below this share of the spread along the
+#: line.
 _STRAIGHT: Final = 0.05
-#: Maximum number of photos on a line that are compared with each other.
+#: Maximum number of photos on a line that are paired with each other.
 _ASKED: Final = 1_000
 
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """The placement of a model on Earth.
+    """The position and orientation of a model on Earth.
 
     Attributes:
-        similarity: From the model to metres east, north, up.
-        residuals: Name of a photo with GPS -> [3] camera position minus GPS position, in metres.
-        agreeing: Names of the photos from which the similarity was found.
+        similarity: From the model to metres east, north and up.
+        residuals: Name of a photo with GPS -> camera position minus GPS position [3], metres.
+        agreeing: Names of the photos with which the similarity was fitted.
     """
 
     similarity: "pycolmap.Sim3d"
@@ -44,7 +45,7 @@ class Placement:
 
     @property
     def rms(self) -> float:
-        """Root mean square of the agreeing residuals, in metres."""
+        """Root mean square residual of the agreeing photos, metres."""
         lengths = [float(np.linalg.norm(self.residuals[name])) for name in sorted(self.agreeing)]
         return float(np.sqrt(np.mean(np.square(lengths))))
 
@@ -60,12 +61,12 @@ def placement_of(
     positions: Mapping[str, NDArray[np.float64]],
     tops: Mapping[str, NDArray[np.float64]],
 ) -> tuple[Placement | None, str]:
-    """Return the placement of a model, or None and the reason why it has no placement.
+    """Return the placement of a model, or None and the reason why there is no placement.
 
     Args:
         model: The model.
-        positions: Name of a photo with GPS -> [3] metres east, north, up.
-        tops: Name of any photo -> [3] camera axis towards the top of the photo.
+        positions: Name of a photo with GPS -> position [3], metres east, north and up.
+        tops: Name of a photo -> camera axis [3] towards the top of the photo.
     """
     centers = centers_of(model)
     names = sorted(centers.keys() & positions.keys())
@@ -110,7 +111,7 @@ def _line(
 ) -> tuple[NDArray[np.float64], tuple[float, float], NDArray[np.float64]]:
     """Fit a line to points [N, 3] and return middle [3], spread along and across, direction [3].
 
-    The spreads are root mean squares.
+    The two spreads are root mean squares.
     """
     middle = points.mean(0)
     _, sizes, axes = np.linalg.svd(points - middle, full_matrices=False)
@@ -121,7 +122,7 @@ def _line(
 def _aligned(
     here: NDArray[np.float64], there: NDArray[np.float64]
 ) -> tuple["pycolmap.Sim3d", NDArray[np.bool_]] | None:
-    """Return the similarity with which most points [N, 3] agree, and the points that agree."""
+    """Return the similarity that most points [N, 3] agree with, and these points."""
     import pycolmap
 
     options = pycolmap.RANSACOptions()
@@ -145,9 +146,9 @@ def _on_a_line(
 ) -> tuple["pycolmap.Sim3d", NDArray[np.bool_]] | None:
     """Return a similarity for points [N, 3] on a line, and the points that agree with it.
 
-    The roll about the line is arbitrary. Scale and direction are medians over all pairs of points
-    (Theil-Sen estimator). If there are more than `_ASKED` points, only `_ASKED` points along the
-    line are paired.
+    The roll of the similarity about the line is arbitrary. Scale and direction are medians over
+    pairs of points (Theil-Sen estimator). If there are more than `_ASKED` points, only `_ASKED` of
+    them, spread along the line, are paired.
     """
     import pycolmap
     from scipy.spatial.transform import Rotation
@@ -178,10 +179,10 @@ def _on_a_line(
 def merged(
     model: "pycolmap.Reconstruction", others: "Sequence[pycolmap.Reconstruction]"
 ) -> "pycolmap.Reconstruction":
-    """Return a model with the added photos and points of other models in the same frame.
+    """Return a model with the photos and points of other models in one common frame.
 
-    Photos that the model already contains are not added again. Other models calibrated their
-    cameras independently, so their cameras are added as new cameras.
+    Photos that are already in the model are not added again. The cameras of other models were
+    calibrated independently, so they are added as new cameras.
     """
     import pycolmap
 

@@ -1,4 +1,4 @@
-"""The folder of a prepared scene: its files, and the check that `prepare` made the folder."""
+"""The folder of a prepared scene: its files, and a check that `prepare` made the folder."""
 
 import shutil
 from dataclasses import dataclass
@@ -15,14 +15,14 @@ from crossgrad_core.commands import (
 )
 from crossgrad_plugins.prepare.pycolmap_calls import is_whole
 
-#: The folder of intermediate files, and the file that shows that `prepare` made this folder.
+#: The folder of intermediate files, and the file that shows that `prepare` made the folder.
 WORK: Final = "prepare"
 PLAN: Final = "plan.json"
 
 
 @dataclass(frozen=True)
 class Layout:
-    """The paths in a scene folder. A file or folder gets its final name only when it is complete.
+    """The paths in a scene folder. A file or folder gets its final name only after it is complete.
 
     Attributes:
         scene: The scene's folder.
@@ -37,7 +37,7 @@ class Layout:
 
     @property
     def plan(self) -> Path:
-        """The photos and settings. The file shows that `prepare` made the folder."""
+        """The photos and settings of the scene. This file shows that `prepare` made the folder."""
         return self.work / PLAN
 
     @property
@@ -47,34 +47,40 @@ class Layout:
 
     @property
     def features(self) -> Path:
-        """Number of features of each photo. The file exists when all features are found."""
+        """Number of features of each photo, written after all features have been found."""
         return self.work / "features.json"
 
     @property
     def links(self) -> Path:
-        """Photo pairs with verified matches. The file exists when all pairs are compared."""
+        """Pairs of photos with verified matches.
+
+        The file is written after all pairs have been compared.
+        """
         return self.work / "links.json"
 
     @property
     def models(self) -> Path:
-        """One folder for each model of the distorted photos. Exists when mapping is finished."""
+        """One folder for each model of the distorted photos.
+
+        The folder gets its name after mapping is finished.
+        """
         return self.work / "models"
 
     @property
     def misplaced(self) -> Path:
-        """The photos that were taken out of models. The file exists when mapping is finished."""
+        """The photos that were removed from models, written after mapping is finished."""
         return self.work / "misplaced.json"
 
     @property
     def placed(self) -> Path:
-        """The model of the scene, georegistered if its place on Earth is known."""
+        """The model of the scene, georegistered if its position on Earth is known."""
         return self.work / "placed"
 
     @property
     def undistorted(self) -> Path:
-        """Undistorted photos before they are moved.
+        """The undistorted photos before they are moved to the final folder.
 
-        Only the scratch folder of this path is ever created.
+        Only the scratch folder of this path is created.
         """
         return self.work / "undistorted"
 
@@ -90,12 +96,15 @@ class Layout:
 
     @property
     def model(self) -> Path:
-        """The model of the undistorted photos. The folder exists when the scene is complete."""
+        """The model of the undistorted photos.
+
+        The folder gets its name after the scene is complete.
+        """
         return self.scene / "sparse" / "0"
 
     @property
     def georef(self) -> Path:
-        """The scene's place on Earth."""
+        """The position of the scene on Earth."""
         return self.scene / "georef.json"
 
     @property
@@ -105,21 +114,21 @@ class Layout:
 
     @property
     def is_ready(self) -> bool:
-        """True if the scene is complete and nothing more has to be written."""
+        """True if the scene is complete and no file has to be written."""
         return self.report.is_file() and self.model.is_dir() and self.images.is_dir()
 
     @property
     def is_whole(self) -> bool:
-        """True if all files exist that show how a finished scene was made."""
+        """True if all files exist that record how a finished scene was made."""
         files, folders = (self.plan, self.features, self.links), (self.models, self.placed)
         return all(path.is_file() for path in files) and all(path.is_dir() for path in folders)
 
 
 def check_ours(layout: Layout, photos: Path) -> None:
-    """Refuse a folder that `prepare` did not make, and a folder among the photos.
+    """Refuse a folder that `prepare` did not make, and a folder inside the folder of photos.
 
     Raises:
-        UserError: The folder is refused. The error tells the user what to do.
+        UserError: The folder is refused; the message says what to do.
     """
     scene = layout.scene
     if layout.is_ready:
@@ -136,7 +145,7 @@ def check_ours(layout: Layout, photos: Path) -> None:
         )
     if layout.plan.is_file() or not scene.is_dir():
         return
-    # Continue only if the folder contains nothing but the lock and temporary plan files of a killed
+    # Continue only if all files in the folder are a lock file or temporary plan files of a killed
     # process.
     left = [path for path in scene.iterdir() if path.name not in {WORK, "run.lock"}]
     if left or (layout.work.is_dir() and any(not _is_hidden(p) for p in layout.work.iterdir())):
@@ -174,7 +183,7 @@ def _is_hidden(path: Path) -> bool:
 
 
 def emptied(folder: Path) -> Path:
-    """Make the folder empty, create it if it is missing, and return it.
+    """Return an empty folder; create the folder if it is missing.
 
     Raises:
         UserError: The disk is full, or the folder is not writable.
@@ -186,9 +195,10 @@ def emptied(folder: Path) -> Path:
 
 
 def clear_leftovers(layout: Layout) -> None:
-    """Delete unfinished files of a killed process. Only one process works in the folder.
+    """Delete unfinished files of a killed process.
 
-    Other hidden files and folders belong to the user, such as version control.
+    This is safe because only one process works in the folder. Other hidden files and folders, such
+    as version control, belong to the user and are kept.
     """
     for made in (layout.undistorted, layout.placed, layout.models):
         _delete(scratch_of(made))
@@ -200,7 +210,7 @@ def clear_leftovers(layout: Layout) -> None:
 
 
 def clear_damaged(layout: Layout) -> None:
-    """Delete truncated models, and everything that was made from truncated models."""
+    """Delete truncated models, and everything that was made from them."""
     damaged = False
     for made in (layout.models, layout.placed, layout.model):
         damaged = damaged or not _is_sound(layout, made)
@@ -209,7 +219,7 @@ def clear_damaged(layout: Layout) -> None:
 
 
 def _is_sound(layout: Layout, made: Path) -> bool:
-    """Return True if the models of a stage are complete, or not made yet."""
+    """Return True if the models of a stage are complete, or if they do not exist yet."""
     models = models_in(made) if made == layout.models else [made]
     return not made.is_dir() or all(is_whole(model) for model in models)
 
@@ -228,5 +238,5 @@ def _delete(path: Path) -> None:
 
 
 def scratch_of(path: Path) -> Path:
-    """Return the scratch path in which a folder is made before it gets its name."""
+    """Return the scratch path where a folder is made before it gets its final name."""
     return path.with_name(f".{path.name}.tmp")

@@ -1,4 +1,4 @@
-"""Mapping: poses and points from matches, as one model or as several unconnected models."""
+"""Mapping: poses and points from matches, as one model or several unconnected models."""
 
 import itertools
 import json
@@ -23,24 +23,24 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-#: First value: minimum number of points for a pose, as in COLMAP's incremental mapping. Second
-#: value: minimum number of points that two photos of a model share, directly or through other
-#: photos, as for a verified pair.
+#: Two limits. The first is the minimum number of points for a pose, as in COLMAP's incremental
+#: mapping. The second is the minimum number of points that two photos of a model share, directly or
+#: through other photos.
 _POINTS, _SHARED = 30, 15
 
 
 def sound_models(
     models: "Iterable[pycolmap.Reconstruction]", smallest: int
 ) -> "list[pycolmap.Reconstruction]":
-    """Return the models without weakly supported photos, each connected part as its own model.
+    """Return the models without weakly supported photos.
 
-    Global mapping places every photo that it can reach by rotations, even through a single wrong
-    pair, and gives no warning. The points that remain after a check show whether the photo is
-    supported.
+    Each connected part becomes a separate model. Global mapping places every photo that rotations
+    connect, even if the only connection is a wrong pair, and gives no warning. The points that are
+    left after a check show if a photo is well supported.
 
     Args:
         models: The models after mapping.
-        smallest: Least number of photos in a model.
+        smallest: Minimum number of photos of a returned model.
     """
     return [
         _only(model, part) for model in models for part in _parts(model) if len(part) >= smallest
@@ -48,7 +48,7 @@ def sound_models(
 
 
 def _parts(model: "pycolmap.Reconstruction") -> list[frozenset[int]]:
-    """Return the numbers of the photos of each connected part."""
+    """Return the photo numbers of each connected part."""
     numbers = np.array(sorted(model.reg_image_ids()))
     counts = np.array([model.image(int(number)).num_points3D for number in numbers])
     held = numbers[counts >= _POINTS]
@@ -68,7 +68,7 @@ def _parts(model: "pycolmap.Reconstruction") -> list[frozenset[int]]:
 
 
 def _only(model: "pycolmap.Reconstruction", part: frozenset[int]) -> "pycolmap.Reconstruction":
-    """Return a copy of the model with only the photos of one part."""
+    """Return a copy of the model that contains only the photos of one part."""
     import pycolmap
 
     alone = pycolmap.Reconstruction(model)
@@ -78,11 +78,11 @@ def _only(model: "pycolmap.Reconstruction", part: frozenset[int]) -> "pycolmap.R
     return alone
 
 
-#: Minimum number of photos for global mapping: first value for one folder, second value for several
-#: folders. Often only few matches connect two folders, and global mapping then misplaces a folder
+#: Minimum number of photos for global mapping: for one folder, and for several folders. Two folders
+#: are often connected by few matches, and global mapping then misplaces one of them
 #: (docs/prepare.md).
 _MANY, _MANY_OF_FOLDERS = 100, 1000
-#: Minimum number of photos in a model.
+#: Minimum number of photos in a model that is kept.
 _SMALLEST: Final = 3
 Models = Mapping[int, "pycolmap.Reconstruction"]
 
@@ -96,7 +96,7 @@ def way_of(plan: Plan) -> str:
 
 
 def found_models(layout: Layout, plan: Plan, threads: int) -> "list[pycolmap.Reconstruction]":
-    """Return the models, sorted by number of photos, the largest first.
+    """Return the models, sorted by number of photos, largest first.
 
     Raises:
         UserError: No two photos could be connected, the disk is full, or pycolmap failed.
@@ -124,7 +124,7 @@ def found_models(layout: Layout, plan: Plan, threads: int) -> "list[pycolmap.Rec
 
 
 def misplaced(layout: Layout) -> dict[str, tuple[int, int]]:
-    """Return the matches for and against the pose of each photo taken out of a model, by name."""
+    """Return by name the matches for and against the pose of each photo that was removed."""
     if not layout.misplaced.is_file():
         return {}
     return {
@@ -135,12 +135,12 @@ def misplaced(layout: Layout) -> dict[str, tuple[int, int]]:
 def _without_misplaced(
     layout: Layout, models: "list[pycolmap.Reconstruction]", settled: frozenset[int] = frozenset()
 ) -> "list[pycolmap.Reconstruction]":
-    """Remove photos whose matches contradict their poses, and store their names and matches.
+    """Remove photos whose matches contradict their poses, and store their names.
 
     Args:
         layout: The paths of the scene.
-        models: The models, the largest first.
-        settled: Photos of the largest model for which no better pose is known.
+        models: The models, largest first.
+        settled: Photos of the largest model for which no better pose was found.
     """
     removed: dict[str, tuple[int, int]] = {}
     for number, model in enumerate(models):
@@ -197,7 +197,8 @@ def _options(threads: int) -> "pycolmap.IncrementalPipelineOptions":
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = threads, 0
     options.min_model_size = _SMALLEST
-    # The fallback also estimates poses from pairs, but it does not check how many pairs agree.
+    # The fallback mapper also estimates poses from pairs of photos, but does not check how many
+    # pairs agree.
     options.structure_less_registration_fallback = False
     return options
 
@@ -209,7 +210,7 @@ def _looked_again(
     scratch: Path,
     models: "list[pycolmap.Reconstruction]",
 ) -> "tuple[list[pycolmap.Reconstruction], frozenset[int]]":
-    """Return the models with doubtful photos refined, and the photos without a better pose."""
+    """Return models with refined photos, and the photos that could not be improved."""
     adjust = partial(_adjusted, threads, Path(plan.photos))
     with disk_errors(scratch):
         return waited(
@@ -224,7 +225,7 @@ def _looked_again(
 def _adjusted(
     threads: int, photos: Path, token: "pycolmap.CancellationToken", database: Path, folder: Path
 ) -> "pycolmap.Reconstruction":
-    """Return the model in a folder after a new triangulation and continued mapping."""
+    """Return the model in a folder after new triangulation and further mapping."""
     import pycolmap
 
     anew, mapped = (emptied(folder / name) for name in ("anew", "found"))

@@ -1,4 +1,4 @@
-"""Masks of photos: pairing with photos, checks, and pixels in the orientation of the photo."""
+"""Masks of photos: search, checks, and conversion to the orientation of the photo."""
 
 import os
 from collections import defaultdict
@@ -19,24 +19,24 @@ from crossgrad_core.scene.photos.shapes import check_mask, is_turned
 from crossgrad_core.scene.wording import count, name_some
 from crossgrad_plugins.prepare.plan import LeftOut, Photo, digest_of
 
-#: Folders with this name contain masks. A file next to a photo is a mask if its stem has one of
-#: these endings.
+#: Name of folders that contain masks. A file next to a photo is a mask if its name without suffix
+#: ends with one of these texts.
 _MASKS: Final = "masks"
 _ENDS: Final = ("_mask", ".mask")
-#: If a mask or the opacity of a pixel has a level below this, the pixel does not count.
+#: A pixel does not count if its mask value or its opacity is below this level.
 HALF: Final = 128
-#: EXIF orientations that rotate a photo by a quarter turn -> orientations that undo this rotation.
+#: EXIF orientations that rotate a photo by a quarter turn -> orientations that undo the rotation.
 _BACK: Final = {5: 5, 6: 8, 7: 7, 8: 6}
 
 
 @dataclass(frozen=True)
 class Sorted:
-    """The image files below a folder, separated into photos and masks by their names.
+    """The image files in a folder, divided into photos and masks by their names.
 
     Attributes:
         photos: Names of the photos.
         masks: Name of a photo with a mask -> its mask.
-        left_out: Reported mask folders, and masks that match no photo.
+        left_out: Mask folders to report, and masks that belong to no photo.
     """
 
     photos: tuple[str, ...]
@@ -45,14 +45,14 @@ class Sorted:
 
 
 def sorted_out(root: Path, files: Sequence[str], wanted: Path | None) -> Sorted:
-    """Separate photos from masks.
+    """Divide image files into photos and masks.
 
     Args:
         root: Folder of the photos.
-        files: Names of the image files below it.
-        wanted: Folder of the masks. If None, masks are searched in three places: in the folder
-            `masks`, in other folders named `masks` whose files match photos next to them, and next
-            to the photos.
+        files: Names of the image files in the folder.
+        wanted: Folder of the masks, or None to search for masks. Masks are searched in three
+            places: in the folder `masks`; in other folders named `masks` whose files match photos
+            beside the folder; and beside the photos.
 
     Raises:
         UserError: The folder is missing, or contains no mask for any photo.
@@ -72,8 +72,7 @@ def sorted_out(root: Path, files: Sequence[str], wanted: Path | None) -> Sorted:
         masks = _usual(root, photos, folders)
     else:
         masks = _wanted(root, photos, wanted)
-        # Remove masks from the list of photos, because the mask folder may be the folder of the
-        # photos.
+        # Remove masks from the list of photos, because masks may be in the folder of the photos.
         taken = frozenset(map(os.path.realpath, masks.values()))
         photos = [name for name in photos if os.path.realpath(root / name) not in taken]
         masks = {name: masks[name] for name in photos if name in masks}
@@ -83,10 +82,10 @@ def sorted_out(root: Path, files: Sequence[str], wanted: Path | None) -> Sorted:
 
 
 def _folders(root: Path, files: Sequence[str], wanted: Path | None) -> dict[str, list[str]]:
-    """Return the mask folders among the photos, with the names of their files.
+    """Return the mask folders inside the folder of photos, with the names of their files.
 
-    The mask folders are the requested folder, the folder `masks` at the top, and every other folder
-    `masks` in which most files are named after photos next to the folder.
+    Mask folders are the requested folder, the folder `masks` at the top, and every other folder
+    `masks` in which most files have the names of photos beside the folder.
     """
     asked = _asked(root, wanted)
 
@@ -112,13 +111,13 @@ def _folders(root: Path, files: Sequence[str], wanted: Path | None) -> dict[str,
 
 
 def _asked(root: Path, wanted: Path | None) -> str | None:
-    """Return the real path of the requested folder, or None if it is the folder of the photos."""
+    """Return the resolved path of the requested folder; None if it is the folder of photos."""
     asked = None if wanted is None else os.path.realpath(wanted)
     return None if asked == os.path.realpath(root) else asked
 
 
 def _below(folder: str, name: str) -> str | None:
-    """Return a photo's name relative to a mask folder's parent, or None if the photo is outside."""
+    """Return a photo's name relative to the parent of a mask folder; None if it is not inside."""
     base = PurePosixPath(folder).parent.as_posix()
     if base == ".":
         return name
@@ -126,7 +125,7 @@ def _below(folder: str, name: str) -> str | None:
 
 
 def _of_photos(root: Path, folder: str, inside: Iterable[str], photos: Sequence[str]) -> set[str]:
-    """Return the files of a mask folder that are named after photos."""
+    """Return the files of a mask folder that have the names of photos."""
     below = (_below(folder, name) for name in photos)
     named = {f"{folder}/{mask}" for name in below if name is not None for mask in mask_names(name)}
     named |= {path.relative_to(root).as_posix() for path in _paired(root, folder, photos).values()}
@@ -134,14 +133,14 @@ def _of_photos(root: Path, folder: str, inside: Iterable[str], photos: Sequence[
 
 
 def _paired(root: Path, folder: str, photos: Sequence[str]) -> dict[str, Path]:
-    """Return the mask of each photo, for masks in a folder below `root` and photos next to it."""
+    """Return the mask of each photo, for a mask folder beside the photos."""
     below = {name: path for name in photos if (path := _below(folder, name)) is not None}
     pairs = pair_masks(root / folder, [*below.values()])
     return {name: pairs[path] for name, path in below.items() if path in pairs}
 
 
 def _usual(root: Path, photos: Sequence[str], folders: Iterable[str]) -> dict[str, Path]:
-    """Return the default masks: in `masks`, in other folders named `masks`, or next to photos."""
+    """Return the masks that are found without a requested folder."""
     stems = {name: str(PurePosixPath(name).with_suffix("")) for name in photos}
     beside = {name: [root / f"{stem}{end}.png" for end in _ENDS] for name, stem in stems.items()}
     masks = _first(root, beside)
@@ -166,7 +165,10 @@ def _wanted(root: Path, photos: Sequence[str], folder: Path) -> dict[str, Path]:
 
 
 def _first(root: Path, places: Mapping[str, Iterable[Path]]) -> dict[str, Path]:
-    """Return the first existing file for each photo. A photo is never its own mask."""
+    """Return for each photo the first of its candidate masks that exists.
+
+    A photo is never its own mask.
+    """
     masks: dict[str, Path] = {}
     for name, paths in places.items():
         photo_file = os.path.realpath(root / name)
@@ -193,7 +195,10 @@ def _check_some(wanted: Path, photos: Sequence[str], masks: Mapping[str, Path]) 
 def _tell_folders(
     root: Path, folders: Mapping[str, Sequence[str]], photos: Sequence[str], wanted: Path | None
 ) -> Iterator[LeftOut]:
-    """Yield messages on mask folders; on `masks` itself only if it contains other files."""
+    """Yield messages about mask folders.
+
+    The folder `masks` is reported only if it contains other files.
+    """
     asked = _asked(root, wanted)
     for folder, inside in sorted(folders.items()):
         named = _of_photos(root, folder, inside, photos)
@@ -210,7 +215,7 @@ def _tell_folders(
 
 
 def _strays(beside: Iterable[str], photos: Iterable[str]) -> Iterator[LeftOut]:
-    """Yield files among the photos that are named like masks but are not masks."""
+    """Yield files beside the photos that are named like masks but belong to no photo."""
     stems = {str(PurePosixPath(name).with_suffix("")) for name in photos}
     masks = {f"{stem}{end}" for stem in stems for end in _ENDS}
     for name in beside:
@@ -225,10 +230,13 @@ def _strays(beside: Iterable[str], photos: Iterable[str]) -> Iterator[LeftOut]:
 
 
 def with_mask(photo: Photo, mask: Path) -> Photo:
-    """Return the photo with its mask. The mask is decoded, so that damage is found early.
+    """Return the photo with its mask.
+
+    The mask is decoded here, so that a damaged mask is found early.
 
     Raises:
-        UserError: The mask is damaged, or matches neither the stored nor the displayed proportions.
+        UserError: The mask is damaged, or its aspect ratio fits neither the stored nor the
+            displayed photo.
     """
     check_mask(mask, (photo.width, photo.height), may_turn=photo.orientation in _BACK)
     decode_mask(mask)
@@ -236,12 +244,12 @@ def with_mask(photo: Photo, mask: Path) -> Photo:
 
 
 def counting_pixels(root: Path, photo: Photo) -> NDArray[np.uint8] | None:
-    """Return [H, W] with 255 for pixels that count by mask and transparency.
+    """Return [H, W] with 255 for pixels that count, by mask and by transparency.
 
-    Return None if all pixels count.
+    If all pixels count, return None.
 
     Raises:
-        UserError: The photo or its mask is damaged, or the mask no longer fits.
+        UserError: The photo or its mask is damaged, or the mask does not fit any more.
     """
     kept = None if photo.mask is None else _as_stored(photo, Path(photo.mask))
     if not photo.transparent:
@@ -254,7 +262,7 @@ def counting_pixels(root: Path, photo: Photo) -> NDArray[np.uint8] | None:
 
 
 def _as_stored(photo: Photo, path: Path) -> NDArray[np.uint8]:
-    """Return a mask [H, W] in the size of its stored photo, rotated back if it was rotated."""
+    """Return a mask [H, W] in the size and orientation of the stored photo."""
     from PIL import Image
 
     size = photo.width, photo.height

@@ -1,4 +1,4 @@
-"""Search for photo pairs whose matches are explained by one epipolar geometry."""
+"""Search for pairs of photos whose matches agree with one epipolar geometry."""
 
 import json
 from dataclasses import dataclass
@@ -17,18 +17,18 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-#: Number of visual words, and number of features from which the words are made. faiss requires 39
-#: features per word.
+#: Number of visual words, and number of features from which the words are computed. faiss needs at
+#: least 39 features per word.
 _WORDS, _SAMPLE = 2048, 100_000
-#: Number of k-means iterations in a single round. One round is enough, because approximate words
-#: are good enough.
+#: Number of iterations of k-means, which is run once. One run is enough, because the words may be
+#: approximate.
 _ITERATIONS: Final = 20
-#: Number of values of a feature, and number of values of its embedding in the index (pycolmap).
+#: Number of values of a feature, and of its embedding in the index (pycolmap).
 _SIFT, _EMBEDDED = 128, 64
 
 
 def index_of(layout: Layout, threads: int) -> Path:
-    """Return the file of the visual index, which is made if it does not exist.
+    """Return the file of the visual index; create the file if it does not exist.
 
     Raises:
         UserError: Pycolmap failed.
@@ -57,7 +57,7 @@ def _build(layout: Layout, threads: int) -> "pycolmap.VisualIndex":
 
 
 def _sample(layout: Layout) -> NDArray[np.float32]:
-    """Return a sample of features [N, 128] with an equal number from each photo."""
+    """Return a sample of features [N, 128], with equally many from each photo."""
     import pycolmap
 
     rng = np.random.default_rng(0)
@@ -77,29 +77,29 @@ def _sample(layout: Layout) -> NDArray[np.float32]:
     return np.concatenate(parts)
 
 
-#: Maximum number of photos for which all pairs are matched. The first value applies to all scenes,
-#: the second to scenes without GPS. The third applies to scenes without GPS whose photos are in
-#: several folders, because only few pairs may connect the folders.
+#: Maximum number of photos for which all pairs are compared. The first value applies to scenes with
+#: GPS, and the second to scenes without GPS. The third value applies to scenes without GPS and with
+#: several folders, because few pairs may connect the folders.
 _FEW, _SOME, _SOME_OF_FOLDERS = 60, 100, 250
 #: Neighbours are chosen by GPS only if at least this share of the photos has GPS.
 _MOST_LOCATED: Final = 0.9
 #: Number of photos with which each photo is compared: the nearest by GPS, the most similar, and the
-#: next by name.
+#: next ones by name.
 _NEAREST, _ALIKE, _NEXT = 40, 40, 5
-#: Number of following photos, in the order of names, that are neighbours of a photo. It applies if
-#: neither GPS nor similarity determines the neighbours.
+#: Number of photos after a photo, in the order of names, that count as its neighbours. This number
+#: is used if neighbours are chosen neither by GPS nor by similarity.
 _NEXT_ALONE: Final = 20
-#: Maximum distance in metres between neighbours by GPS. A photo with a wrong GPS position therefore
-#: has no neighbours by GPS.
+#: Maximum distance in metres between neighbours by GPS. A photo with a wrong GPS position is
+#: therefore not paired with wrong neighbours.
 _FARTHEST: Final = 500.0
-#: Maximum number of features of a photo that are used to find similar photos.
+#: Maximum number of features per photo for the search of similar photos.
 _LOOKED_UP: Final = 2000
-#: Maximum number of geometries that are tried for the matches of a pair. For a pair that shares no
-#: content, COLMAP tries five times as many.
+#: Maximum number of geometries that are tried for the matches of a pair. COLMAP's default is five
+#: times as many, which costs time for pairs without common content.
 _TRIALS: Final = 2000
-#: Number of bytes of a pair in the database for each requested feature of a photo.
+#: Number of bytes of a pair in the database, per requested feature of a photo.
 _BYTES_OF_PAIR: Final = 2
-#: Method for choosing photos to compare -> pycolmap's pairing methods.
+#: Method of choosing pairs -> pycolmap's pairing methods.
 _WAYS: Final = {
     "exhaustive": ("exhaustive",),
     "spatial": ("spatial", "sequential"),
@@ -110,12 +110,12 @@ _WAYS: Final = {
 
 @dataclass(frozen=True)
 class Link:
-    """Two photos that show the same scene content.
+    """Two photos that show some of the same scene content.
 
     Attributes:
         first: Name of one photo.
         second: Name of the other photo.
-        matches: Number of matches that the epipolar geometry of the two photos explains.
+        matches: Number of matches that agree with the epipolar geometry of the two photos.
     """
 
     first: str
@@ -124,7 +124,7 @@ class Link:
 
 
 def way_of(plan: Plan) -> str:
-    """Return the name of the method that chooses photos to compare."""
+    """Return the name of the method that chooses the pairs to compare."""
     chosen, photos = plan.settings.matching, len(plan.used)
     if chosen != "auto":
         return chosen
@@ -137,7 +137,7 @@ def way_of(plan: Plan) -> str:
 
 
 def check_gps(plan: Plan) -> None:
-    """Refuse to choose neighbours by GPS if fewer than two photos have GPS.
+    """Refuse neighbours by GPS if fewer than two photos have GPS.
 
     Raises:
         UserError: Fewer than two photos have GPS.
@@ -152,7 +152,9 @@ def check_gps(plan: Plan) -> None:
 
 
 def found_links(layout: Layout, plan: Plan, threads: int) -> tuple[Link, ...]:
-    """Return the pairs with verified matches. Finished pairs are not compared again.
+    """Return the pairs with verified matches.
+
+    Pairs that were compared before are not compared again.
 
     Raises:
         UserError: The disk is full, or pycolmap failed.
@@ -178,7 +180,10 @@ def found_links(layout: Layout, plan: Plan, threads: int) -> tuple[Link, ...]:
 
 
 def _room(layout: Layout, plan: Plan, way: str) -> int:
-    """Return the bytes that missing pairs need, because SQLite aborts on a full disk."""
+    """Return the free bytes that are needed for the missing pairs.
+
+    They are checked in advance, because SQLite aborts the process on a full disk.
+    """
     photos = len(plan.used)
     pairs_per_photo = {"exhaustive": photos / 2, "sequential": _NEXT_ALONE}.get(way, _ALIKE + _NEXT)
     missing = photos * min(pairs_per_photo, photos / 2) - rows_of(
@@ -198,7 +203,8 @@ def _match(
 
     matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
     matching.num_threads = threads
-    # Each pair has a fixed seed, so that results do not depend on the order or on interruptions.
+    # Every pair uses a fixed seed, so that results do not depend on the order of pairs or on
+    # interruptions.
     verification.ransac.random_seed = 0
     verification.ransac.max_num_trials = _TRIALS
     compare = getattr(pycolmap, f"match_{way}")
@@ -209,7 +215,7 @@ def _match(
 
 
 def _pairing(method: str, layout: Layout, way: str, threads: int) -> object:
-    """Return pycolmap's options for one of its pairing methods."""
+    """Return pycolmap's options for a pairing method."""
     import pycolmap
 
     options: Any
@@ -233,7 +239,10 @@ def _pairing(method: str, layout: Layout, way: str, threads: int) -> object:
 
 
 def _pairs(layout: Layout, pairings: dict[str, object]) -> str:
-    """Return the number of pairs to compare as text (" of 378"), or "" if it is slow to compute."""
+    """Return a text such as " of 378": the number of pairs to compare.
+
+    The text is empty if the number takes long to compute.
+    """
     import pycolmap
 
     kinds: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""The photos of a folder: usable photos with their metadata, and unusable files."""
+"""The photos of a folder: usable photos with metadata, and files that cannot be used."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -31,7 +31,7 @@ _MAKE, _MODEL, _FOCAL, _FOCAL_35 = 0x010F, 0x0110, 0x920A, 0xA405
 
 
 def camera_of(image: "Image") -> str:
-    """Return make, model and focal length from EXIF, which are equal for photos with one zoom."""
+    """Return make, model and focal length from EXIF; they are equal for photos with equal zoom."""
     header = image.getexif()
     details = header.get_ifd(_EXIF)
     parts = [header.get(_MAKE), header.get(_MODEL), _number(details.get(_FOCAL)),
@@ -40,13 +40,13 @@ def camera_of(image: "Image") -> str:
 
 
 def orientation_of(image: "Image") -> int:
-    """Return the EXIF orientation of the photo, 1 to 8, or 1 if it is missing."""
+    """Return the photo's EXIF orientation, 1 to 8; 1 if it is missing."""
     orientation = image.getexif().get(_ORIENTATION)
     return orientation if isinstance(orientation, int) and orientation in _ORIENTATIONS else 1
 
 
 def position_of(image: "Image") -> Position | None:
-    """Return the GPS position of the photo, or None if it is missing or invalid."""
+    """Return the photo's GPS position, or None if it is missing or invalid."""
     latitude, longitude, altitude = gps_of(image)
     if not is_place(latitude, longitude) or not isfinite(altitude):
         return None
@@ -61,7 +61,7 @@ def _number(value: object) -> float | None:
     return number if isfinite(number) else None
 
 
-#: Suffixes of photo files that pycolmap reads, and of other files of cameras and editors.
+#: Suffixes of photo files that pycolmap reads, and of other files that cameras and editors write.
 _READ: Final = frozenset({".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff"})
 _UNREAD: Final = frozenset(
     {".arw", ".avif", ".cr2", ".cr3", ".dng", ".gif", ".heic", ".heif", ".jp2", ".jxl", ".nef",
@@ -72,14 +72,14 @@ _IMPOSSIBLE: Final = (
     "its name has control characters or backslashes, is too long or is not UTF-8: rename it"
 )
 _SMALLEST: Final = 64
-#: Factor on the largest number of pixels for JPEG files that the decoder can reduce. Phones take
-#: photos of 200 megapixels.
+#: For JPEG files, which can be decoded at reduced size, the maximum number of pixels is multiplied
+#: by this factor. Phones take photos of 200 megapixels.
 _REDUCIBLE: Final = 2
-#: Approximate longest side in pixels of the reduced photos that are inspected.
+#: Approximate longest side, in pixels, of the reduced photos that are inspected.
 _LOOKED_AT: Final = 1024
 _AT_ONCE: Final = 4
-#: Large photos are those above a fixed share of the maximum size. This lock makes sure that they
-#: are decoded one at a time.
+#: Photos above a fixed share of the maximum size count as large. The lock makes sure that only one
+#: large photo is decoded at a time.
 _LARGE: Final = Lock()
 Tell = Callable[[int, int], None]
 
@@ -92,14 +92,14 @@ def find_photos(
     Every photo is decoded at a reduced size, so that damaged photos are found early.
 
     Args:
-        root: The folder.
+        root: Folder of the photos.
         settings: Settings that give the mask folder, and the photos that share a calibration.
-        tell: Called with the number of inspected photos and the number of all photos.
-        fewest: Least number of photos. A pose requires at least two photos.
+        tell: Function that gets the number of inspected photos and the number of all photos.
+        fewest: Minimum number of photos. At least two photos are needed for a pose.
 
     Raises:
-        UserError: The folder is missing, it contains too few usable photos, a photo is too large
-            to be decoded, or a mask does not fit or is damaged.
+        UserError: The folder is missing or contains too few usable photos, a photo is too large, or
+            a mask is damaged or does not fit.
     """
     _check_folder(root)
     wanted = None if settings.masks is None else Path(settings.masks)
@@ -144,7 +144,7 @@ def _check_folder(root: Path) -> None:
 
 
 def _check_text(folder: Path) -> None:
-    """Refuse a folder whose name cannot be written into the plan."""
+    """Refuse a folder whose name cannot be stored in the plan."""
     try:
         str(folder).encode()
     except UnicodeEncodeError as error:
@@ -157,28 +157,28 @@ def _check_text(folder: Path) -> None:
 
 
 def _names(root: Path) -> Iterator[str]:
-    """Yield paths of all files below a folder, sorted in each folder, without hidden files."""
+    """Yield the paths of all files below a folder, sorted by name, without hidden files."""
     for below, folders, files in walked(root):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         here = PurePosixPath(below)
         yield from ((here / file).as_posix() for file in sorted(files) if file[0] != ".")
 
 
-#: Pillow's names for TIFF pixel modes that are not used for photos.
+#: Pillow's names of TIFF pixel modes that photos do not have.
 _MODES_OF_TIFF: Final = ("I", "1")
 _VALUES: Final = {"F": "floating point", "I": "32 bits", "1": "1 bit"}
 
 
 def _listed(names: Iterable[str]) -> tuple[list[str], list[LeftOut]]:
-    """Return the usable photo names, and the files that are unusable because of their name."""
+    """Return the names of usable photos, and the files with unusable names."""
     usable, left_out = [], []
     for name in names:
         suffix = PurePosixPath(name).suffix.lower()
         if suffix in _UNREAD:
             what = suffix[1:].upper()
             left_out.append(LeftOut(name=_shown(name), why=f"{what} cannot be read: save as JPEG"))
-        # Test the name of the photo's mask, which has one more suffix. Backslashes occur in COLMAP
-        # models from Windows.
+        # Test the name of the photo's mask too; it is the photo's name with a further suffix.
+        # COLMAP models that were made on Windows contain backslashes.
         elif "\\" in name or not is_possible_name(f"{name}.png"):
             left_out.append(LeftOut(name=_shown(name), why=_IMPOSSIBLE))
         else:
@@ -224,7 +224,7 @@ def _read(root: Path, name: str, header: PhotoHeader, cameras: str) -> Photo:
     path = root / name
     with opened(path, "the photo cannot be decoded") as image:
         if image.mode == "F" or (image.format == "TIFF" and image.mode in _MODES_OF_TIFF):
-            # COLMAP would write such photos in a format that no program reads.
+            # COLMAP would write the undistorted photo in a format that no program can read.
             raise UserError(
                 "the pixel values of the photo have a type that photos do not use",
                 where=path,
@@ -261,10 +261,10 @@ def _reason(error: UserError | OSError) -> str:
 
 
 def _look(image: "Image", header: PhotoHeader) -> tuple[float, float, bool]:
-    """Return brightness (mean grey), sharpness (mean squared Laplacian) and transparency."""
+    """Return brightness (mean grey level), sharpness (mean squared Laplacian) and transparency."""
     longest = max(image.size)
     image.draft("L", (image.width * _LOOKED_AT // longest, image.height * _LOOKED_AT // longest))
-    # Skip photos with more than 8 bits, because the core also ignores their transparency.
+    # Skip photos with more than 8 bits per channel, because training ignores their transparency.
     transparent = False
     if header.alpha and not image.mode.startswith(("I", "F")):
         least, _ = image.convert("RGBA").getchannel("A").getextrema()
@@ -278,7 +278,10 @@ def _look(image: "Image", header: PhotoHeader) -> tuple[float, float, bool]:
 
 
 def _most_pixels(header: PhotoHeader) -> int:
-    """Return the maximum pixel count of a photo, because COLMAP decodes photos at full size."""
+    """Return the maximum number of pixels of a photo.
+
+    It is limited because COLMAP decodes photos at full size.
+    """
     return pillow.MOST_PIXELS * (_REDUCIBLE if header.reducible else 1)
 
 
@@ -296,7 +299,7 @@ def _too_large(path: Path, header: PhotoHeader) -> UserError:
 
 
 def _without_doubles(photos: Sequence[Photo]) -> tuple[list[Photo], list[LeftOut]]:
-    """Return the photos without duplicate files. The first photo of each file is kept."""
+    """Return the photos without copies of a file; the first of several equal files is kept."""
     first: dict[str, Photo] = {}
     for photo in photos:
         first.setdefault(photo.sha256, photo)

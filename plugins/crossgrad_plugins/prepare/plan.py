@@ -1,6 +1,6 @@
 """The plan of a scene: photos and settings.
 
-A later call on the same scene must have the same plan.
+A later call for the scene must have an equal plan.
 """
 
 import hashlib
@@ -14,7 +14,8 @@ from crossgrad_core.commands import UserError, write_atomically
 from crossgrad_core.scene.wording import count, name_some
 from crossgrad_plugins.prepare.layout import Layout
 
-#: Version of the file. It is raised if an older reader could misread the new format.
+#: Version of the plan's format. It is increased if older versions of crossgrad could misread the
+#: format.
 FORMAT: Final = 1
 
 
@@ -23,17 +24,17 @@ class _Fixed(BaseModel):
 
 
 class Settings(_Fixed):
-    """The settings chosen by the user.
+    """Settings that the user chose.
 
     Attributes:
-        features: Kind of features.
-        matching: Method that chooses photos to compare.
-        mapper: Method that finds poses.
-        cameras: Rule that decides which photos share a calibration.
-        lens: Camera model of COLMAP.
-        masks: Folder of masks, or None for masks next to the photos.
-        max_size: Longest side of the scene's photos in pixels, or None to keep their size.
-        max_features: Greatest number of features of a photo.
+        features: Kind of features to find.
+        matching: Method that chooses the pairs to compare.
+        mapper: Method that estimates poses.
+        cameras: Rule that determines which photos have a common calibration.
+        lens: COLMAP's name of the camera model.
+        masks: Folder of the masks; None to search for masks.
+        max_size: Longest side of the undistorted photos in pixels; None keeps their size.
+        max_features: Maximum number of features of a photo.
     """
 
     features: str = "sift"
@@ -47,7 +48,7 @@ class Settings(_Fixed):
 
 
 class Position(_Fixed):
-    """A place on Earth: degrees, and altitude in metres above the receiver's reference."""
+    """A GPS position: degrees, and altitude in metres above the reference of the receiver."""
 
     latitude: float
     longitude: float
@@ -59,19 +60,19 @@ class Photo(_Fixed):
 
     Attributes:
         name: Path relative to the folder of photos, with forward slashes.
-        folder: Folder of the photo, or an empty text.
+        folder: Folder of the photo relative to the folder of photos; empty for the top.
         width: Width in pixels, as stored.
         height: Height in pixels, as stored.
         orientation: EXIF orientation, or 1 if it is missing.
-        camera: Key that photos with the same calibration share.
+        camera: Key of the calibration; photos with equal keys have a common calibration.
         position: GPS position, or None.
         mask: Path of the mask, or None.
         mask_sha256: Digest of the mask, or None in plans of older versions.
-        transparent: True if the photo has pixels with alpha below 0.5, which are ignored.
+        transparent: True if some pixels have an alpha below 0.5; these pixels do not count.
         brightness: Mean of the grey levels, 0 to 255.
-        sharpness: Mean square of the Laplacian of the grey levels at a reduced size.
-        bytes: Size of the file.
-        sha256: Digest of the file.
+        sharpness: Mean squared Laplacian of the grey levels at a reduced size.
+        bytes: Size of the file in bytes.
+        sha256: SHA-256 digest of the file.
     """
 
     name: str
@@ -91,7 +92,7 @@ class Photo(_Fixed):
 
 
 class LeftOut(_Fixed):
-    """A file that is not used, and the reason."""
+    """A file that is not used, with the reason."""
 
     name: str
     why: str
@@ -101,7 +102,7 @@ class Plan(_Fixed):
     """The photos and settings of a scene.
 
     Attributes:
-        format: Version of the file.
+        format: Version of the format.
         photos: Folder of the photos.
         settings: Settings chosen by the user.
         used: The photos that are used, sorted by name.
@@ -126,13 +127,13 @@ class Plan(_Fixed):
 
 
 def agreed(layout: Layout, plan: Plan) -> Plan:
-    """Return the plan to carry out, and write it if the scene has no plan yet.
+    """Return the plan of the scene; write the given plan if the scene has none.
 
-    The same photos and masks may be in another folder than before. A finished scene no longer
-    needs its photos, so some may be missing.
+    Photos and masks may be in another folder than in an earlier call. A finished scene does not
+    need its photos any more, so some of them may be missing.
 
     Raises:
-        UserError: The scene was begun with other photos or settings, or its plan is damaged.
+        UserError: The scene was started with other photos or settings, or its plan is damaged.
     """
     earlier = read_plan(layout) if layout.plan.is_file() else None
     if earlier is not None:
@@ -162,7 +163,7 @@ def read_plan(layout: Layout) -> Plan:
     """Return the plan of a scene.
 
     Raises:
-        UserError: The plan is damaged, or of a later version.
+        UserError: The plan is damaged, or was written by a later version.
     """
     try:
         plan = Plan.model_validate_json(layout.plan.read_bytes())
@@ -185,15 +186,15 @@ def read_plan(layout: Layout) -> Plan:
 
 
 def _difference(earlier: Plan, plan: Plan, *, may_lack_photos: bool) -> str:
-    """Describe the differences between two plans. Return an empty text for equal plans.
+    """Describe the differences between two plans. The text is empty for equal plans.
 
     Args:
-        earlier: The plan of the scene.
+        earlier: The stored plan of the scene.
         plan: The new plan.
-        may_lack_photos: True if photos of the old plan may be missing from the new plan.
+        may_lack_photos: True if photos of the stored plan may be missing in the new plan.
     """
     was, now = earlier.settings.model_dump(), plan.settings.model_dump()
-    # Compare only the content of masks, not their folder.
+    # Compare only the contents of masks, not their folder.
     changes = [f"{key} was {was[key]}, now {now[key]}" for key in was
             if was[key] != now[key] and key != "masks"]  # fmt: skip
     after = {photo.name: photo for photo in plan.used}
@@ -204,7 +205,7 @@ def _difference(earlier: Plan, plan: Plan, *, may_lack_photos: bool) -> str:
     changes += _changes("photo", *sums)
     both = [(before[name], after[name]) for name in before.keys() & after.keys()]
     new = {photo.name: photo.mask_sha256 for _, photo in both if photo.mask}
-    # Older plans contain no mask digests.
+    # Plans of older versions contain no digests of masks.
     old = {old_photo.name: old_photo.mask_sha256 or photo.mask_sha256 for old_photo, photo in both
            if old_photo.mask and (photo.mask or not may_lack_photos)}  # fmt: skip
     return "; ".join([*changes, *_changes("mask", old, new)])
@@ -213,7 +214,7 @@ def _difference(earlier: Plan, plan: Plan, *, may_lack_photos: bool) -> str:
 def _changes(
     noun: str, before: Mapping[str, str | None], after: Mapping[str, str | None]
 ) -> list[str]:
-    """Describe new, missing and changed files by their names and digests."""
+    """Describe new, missing and changed files, found by names and digests."""
     kinds = {
         "new": after.keys() - before.keys(),
         "gone": before.keys() - after.keys(),

@@ -1,11 +1,11 @@
 """Pose of a photo from its verified pairs, by rays and epipolar lines.
 
-All pairs with photos that have poses are used. The relative pose of a pair gives a rotation and a
-direction from the other photo. The distance comes from the direction of a second pair, or from
-points that the other photo shows. Each distance gives one candidate pose. The candidate with the
-most agreeing matches is used. A pair counts only if enough of its matches agree. Source of the
-relative pose: Hartley and Zisserman, Multiple View Geometry, 9.6. The other steps were developed
-for crossgrad.
+All pairs with photos whose poses are known are used. The relative pose of a pair gives the rotation
+of the photo, and the direction from the other photo to it. The distance between the photos follows
+from the direction of a second pair, or from points that the other photo shows. Each possible
+distance gives one candidate pose. The candidate with the most agreeing matches is chosen. A pair
+counts only if enough of its matches agree with the pose. Source: Hartley and Zisserman, Multiple
+View Geometry, 9.6, for the relative pose. The other steps were developed for crossgrad.
 """
 
 import itertools
@@ -20,46 +20,48 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-#: Minimum number of verified matches of a pair, share of its matches that must agree with two
-#: poses, and maximum distance in pixels between an agreeing match and its epipolar line. This
-#: distance is larger than in verification, because a pose is not exact before bundle adjustment.
+#: Minimum number of verified matches of a pair, minimum share of the matches that must agree with
+#: two poses, and maximum distance in pixels from an agreeing match to its epipolar line. The
+#: distance is larger than in COLMAP's verification, because a pose is inexact before bundle
+#: adjustment.
 _MATCHES, _AGREEING, _PIXELS = 15, 0.5, 6.0
-#: A pose needs a minimum number of pairs and a minimum number of agreeing matches. One of these two
-#: combinations must be reached.
+#: A pose needs a minimum number of pairs together with a minimum number of agreeing matches. One of
+#: these two combinations is sufficient.
 _NEEDED: Final = ((3, 60), (2, 100))
-#: Number of a photo's pairs that give candidate poses. The pairs with the most matches are used.
+#: Number of a photo's pairs from which candidate poses are computed. The pairs with the most
+#: matches are chosen.
 _ASKED: Final = 16
-#: Minimum number of points that determine a distance, and quantiles of the distances that are
-#: tried.
+#: Minimum number of points that determine a distance, and the quantiles of the distances that
+#: become candidates.
 _POINTS, _QUANTILES = 4, (0.35, 0.5, 0.65)
-#: Two directions are intersected if their rotations differ by at most 5 degrees and the directions
-#: differ by at least 2 degrees. Both values are cosines of these angles.
+#: Two directions are intersected if their rotations differ by at most 5 degrees and if the
+#: directions differ by at least 2 degrees. The values are the cosines of these angles.
 _SAME_ROTATION, _SAME_DIRECTION = 0.9962, 0.9994
 
 
 @dataclass(frozen=True, order=True)
 class Support:
-    """Evidence for a pose: the number of agreeing matches and the number of their pairs."""
+    """Evidence for a pose: number of agreeing matches, and number of pairs that contain them."""
 
     matches: int = 0
     pairs: int = 0
 
     @property
     def enough(self) -> bool:
-        """True if the evidence is enough for a pose."""
+        """True if the evidence is sufficient for a pose."""
         return any(self.pairs >= pairs and self.matches >= least for pairs, least in _NEEDED)
 
 
 @dataclass(frozen=True, eq=False)
 class PairView:
-    """A pair of a photo with another photo that has a pose.
+    """A pair of a photo with another photo whose pose is known.
 
     Attributes:
         other: Number of the other photo.
         pose: Pose of the other photo, world to camera.
         focals: Focal length of the other photo and of this photo, in pixels.
-        rays: [N, 2] matches in the other photo and in this photo, in units of the focal length.
-        features: [N] indices of the matched features of the other photo.
+        rays: [N, 2] matches in the other photo and in this photo, divided by the focal length.
+        features: [N] indices of the matched features in the other photo.
     """
 
     other: int
@@ -69,18 +71,17 @@ class PairView:
     features: NDArray[np.int64]
 
     def agreeing(self, pose: "pycolmap.Rigid3d") -> int:
-        """Return the number of matches that agree with a pose, or 0 if too few agree."""
+        """Return the number of matches that agree with a pose; 0 if too few agree."""
         near = int((off_lines((self.pose, pose), self.rays, self.focals) <= _PIXELS).sum())
         return near if near >= _AGREEING * len(self.features) else 0
 
     def relative(self) -> "pycolmap.Rigid3d | None":
-        """Return the photo's pose relative to the other photo, up to the translation's length."""
+        """Return the pose relative to the other photo; the length of the translation is unknown."""
         import pycolmap
 
         options = pycolmap.TwoViewGeometryOptions()
         options.compute_relative_pose, options.ransac.random_seed = True, 0
-        # Do not search for watermarks again: verification did this already, and these cameras have
-        # no borders.
+        # Do not search for watermarks again, because verification has removed such matches.
         options.detect_watermark = False
         cameras = [
             pycolmap.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[focal, 0, 0])
@@ -99,11 +100,11 @@ class PairView:
 
 
 class Pairs:
-    """All verified pairs of a database, as rays of their cameras.
+    """All verified pairs of a database, as rays of the cameras.
 
     Args:
-        cameras: Cameras by number. Missing cameras are read from the database.
-        database: COLMAP's database, open.
+        cameras: Known cameras by number. Other cameras are read from the database.
+        database: COLMAP's database, already open.
     """
 
     def __init__(
@@ -124,7 +125,7 @@ class Pairs:
                 self.partners.setdefault(two, []).append(one)
 
     def sights(self, photo: int, poses: "Mapping[int, pycolmap.Rigid3d]") -> list[PairView]:
-        """Return the pairs of a photo with photos that have poses, most matches first."""
+        """Return the pairs of a photo with photos of known pose, most matches first."""
         sights = []
         for other in self.partners.get(photo, ()):
             if other in poses:
@@ -136,12 +137,12 @@ class Pairs:
         return sorted(sights, key=lambda sight: (-len(sight.features), sight.other))
 
     def without(self, aside: Collection[tuple[int, int]]) -> frozenset[int]:
-        """Return the photos for which `aside` contains all pairs of the photo."""
+        """Return the photos all of whose pairs are in `aside`."""
         left = {photo for pair in self.matches if pair not in aside for photo in pair}
         return frozenset(self.partners.keys() - left)
 
     def contradicting(self, poses: "Mapping[int, pycolmap.Rigid3d]") -> frozenset[tuple[int, int]]:
-        """Return the pairs of posed photos whose matches contradict the poses."""
+        """Return the pairs of photos with poses whose matches contradict these poses."""
         return frozenset(
             (sight.other, photo)
             for photo in poses
@@ -151,7 +152,7 @@ class Pairs:
 
 
 def support(sights: Sequence[PairView], pose: "pycolmap.Rigid3d") -> Support:
-    """Return the evidence for a pose."""
+    """Return the evidence of all pairs for a pose."""
     agreeing = [count for sight in sights if (count := sight.agreeing(pose))]
     return Support(sum(agreeing), len(agreeing))
 
@@ -159,9 +160,9 @@ def support(sights: Sequence[PairView], pose: "pycolmap.Rigid3d") -> Support:
 def best_place(
     model: "pycolmap.Reconstruction", sights: Sequence[PairView]
 ) -> "tuple[Support, pycolmap.Rigid3d | None]":
-    """Return the pose with the most evidence, and the evidence.
+    """Return the pose with the most evidence, and this evidence.
 
-    The pose is None if there is no evidence.
+    The pose is None if no pose has evidence.
     """
     most, best = Support(), None
     for pose in _places(model, sights[:_ASKED]):
@@ -186,13 +187,13 @@ def _places(
 
 @dataclass(frozen=True, eq=False)
 class _Way:
-    """A half-line that contains the centre of a photo according to one pair.
+    """A half-line that, according to one pair, contains the centre of a photo.
 
     Attributes:
-        rotation: [3, 3] world to the photo.
-        start: [3] centre of the other photo.
-        direction: [3] direction from the other photo to the photo, of length 1.
-        distances: Distances along the direction, computed from points that the other photo shows.
+        rotation: [3, 3] rotation from the world to the photo.
+        start: [3] centre of the other photo, where the half-line starts.
+        direction: [3] unit direction from the other photo to the photo.
+        distances: Possible distances along the half-line, from points that the other photo shows.
     """
 
     rotation: NDArray[np.float64]
@@ -201,16 +202,16 @@ class _Way:
     distances: NDArray[np.float64]
 
     def to(self, distance: float) -> "pycolmap.Rigid3d":
-        """Return the pose at a distance."""
+        """Return the pose at a distance along the half-line."""
         import pycolmap
 
         center = self.start + distance * self.direction
         return pycolmap.Rigid3d(pycolmap.Rotation3d(self.rotation), -self.rotation @ center)
 
     def crossing(self, other: "_Way") -> float | None:
-        """Return the distance at which another half-line crosses this half-line.
+        """Return the distance at which another half-line crosses this one.
 
-        Return None if they do not cross.
+        The result is None if the half-lines do not cross.
         """
         turned = (np.trace(self.rotation @ other.rotation.T) - 1.0) / 2.0
         along = float(self.direction @ other.direction)
@@ -243,7 +244,7 @@ def _distances(
     rotation: NDArray[np.float64],
     direction: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the distances [M] at which the photo sees points of the other photo correctly."""
+    """Return the distances [M] at which the photo's rays meet points of the other photo."""
     points = model.image(sight.other).points2D
     rows = [row for row, at in enumerate(sight.features) if points[int(at)].has_point3D()]
     if not rows:
@@ -252,7 +253,8 @@ def _distances(
     offsets = np.stack(positions) - sight.pose.inverse().translation
     rays = np.column_stack([sight.rays[1][rows], np.ones(len(rows))]) @ rotation
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    # In the plane perpendicular to the ray to a point, offset and direction are parallel.
+    # Project everything onto the plane perpendicular to the ray to a point; there, offset and
+    # direction are parallel at the correct distance.
     across = direction - rays * (rays @ direction)[:, None]
     beside = offsets - rays * (rays * offsets).sum(axis=1, keepdims=True)
     square = (across**2).sum(axis=1)
@@ -263,11 +265,13 @@ def _distances(
 
 
 class Rays:
-    """Features of photos without lens distortion; they are read when needed, and cached.
+    """Features of photos without lens distortion.
+
+    They are read when they are needed, and cached.
 
     Args:
-        cameras: Cameras by number. Missing cameras are read from the database.
-        database: COLMAP's database, open.
+        cameras: Known cameras by number. Other cameras are read from the database.
+        database: COLMAP's database, already open.
     """
 
     def __init__(
@@ -291,7 +295,7 @@ class Rays:
         return float(self.camera(number).mean_focal_length())
 
     def of(self, number: int) -> NDArray[np.float32]:
-        """Return the features [N, 2] of a photo, in units of the focal length."""
+        """Return the features [N, 2] of a photo, divided by the focal length."""
         if number not in self._rays:
             pixels = np.asarray(self._database.read_keypoints(number)[:, :2], dtype=np.float64)
             rays = self.camera(number).cam_from_img(pixels)
@@ -304,13 +308,13 @@ def off_lines(
     rays: tuple[NDArray[np.float32], NDArray[np.float32]],
     focals: tuple[float, float],
 ) -> NDArray[np.float64]:
-    """Return the distances [N] of matches from epipolar lines, in pixels.
+    """Return the distances [N] of matches to their epipolar lines, in pixels.
 
-    The larger of the distances in both photos is returned.
+    Of the distances in the two photos, the larger one is returned.
 
     Args:
         poses: Poses of two photos, world to camera.
-        rays: [N, 2] matches in each photo, in units of the focal length.
+        rays: [N, 2] matches in each photo, divided by the focal length.
         focals: Focal length of each photo, in pixels.
     """
     relative = poses[1] * poses[0].inverse()
@@ -320,8 +324,8 @@ def off_lines(
     here, there = (np.column_stack([points, np.ones(len(points))]) for points in rays)
     lines, back = here @ essential.T, there @ essential
     error = np.abs((there * lines).sum(axis=1))
-    # Two photos with the same centre have no epipolar lines, so their matches cannot contradict
-    # their poses.
+    # Two photos with one centre have no epipolar lines, so their matches cannot contradict the
+    # poses.
     tiny = np.finfo(np.float64).tiny
     in_other = error / np.maximum(tiny, np.hypot(lines[:, 0], lines[:, 1])) * focals[1]
     in_one = error / np.maximum(tiny, np.hypot(back[:, 0], back[:, 1])) * focals[0]

@@ -1,7 +1,6 @@
-"""Long calls of pycolmap, and a check of the models that pycolmap writes.
+"""Long calls of pycolmap, and a check of models that pycolmap writes.
 
-The models are checked before pycolmap reads them, because pycolmap loops without end on truncated
-files.
+Models are checked before pycolmap reads them, because pycolmap never returns from truncated files.
 """
 
 import struct
@@ -23,28 +22,28 @@ if TYPE_CHECKING:
 
 
 T = TypeVar("T")
-#: Seconds between two checks of a running call, and seconds between two progress messages.
+#: Seconds between two checks of a running call, and between two progress messages.
 _LOOK, _PAUSE = 0.1, 10.0
-#: Program that counts the rows of a table. It is stopped after `_PATIENCE` seconds.
+#: Program that counts the rows of a database table. It is stopped after `_PATIENCE` seconds.
 _COUNT: Final = (
     "import sqlite3, sys; found = sqlite3.connect(sys.argv[1] + '?mode=ro', uri=True);"
     "print(*found.execute('SELECT COUNT(*) FROM ' + sys.argv[2]).fetchone())"
 )
 _PATIENCE: Final = 5.0
-#: Maximum number of bytes of the journal that SQLite writes next to a database.
+#: Maximum number of bytes of the journal that SQLite writes beside a database.
 JOURNAL: Final = 2**23
-#: Glog's level of fatal messages. Messages of lower levels are not useful to the user, because a
-#: failure raises an exception or leaves a file missing.
+#: glog's level for fatal messages. Messages of lower levels do not help the user, because a failed
+#: call raises an exception or does not write its file.
 _FATAL: Final = 3
-#: Files of a model that the reader does not check -> number of bytes of a record. All records are
-#: equal in size, because each rig of `prepare` is one camera, and each frame is one photo.
+#: Files of a model that pycolmap's reader does not check -> number of bytes of a record. All
+#: records of such a file have one size, because each rig is one camera and each frame is one photo.
 _RECORDS: Final = {"rigs.bin": 16, "frames.bin": 84}
 _COUNT_OF_RECORDS: Final = struct.Struct("<Q")
 
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Silence pycolmap's messages inside the `with` block."""
+    """Suppress pycolmap's messages inside the `with` block."""
     guard_pycolmap()
     import pycolmap
 
@@ -58,15 +57,17 @@ def quiet() -> Iterator[None]:
 def waited(
     what: str, call: "Callable[[pycolmap.CancellationToken], T]", far: Callable[[], str]
 ) -> T:
-    """Run a long call in another thread, so that signals are handled, and return its result.
+    """Run a long call in another thread, and return its result.
+
+    The main thread stays free to handle signals.
 
     Args:
         what: Name of the call, for messages.
-        call: The call. The argument of the call is a token by which the call can be cancelled.
-        far: Function that returns the progress as text. The function is called every few seconds.
+        call: The call, whose argument is a token for its cancellation.
+        far: Function that returns the progress as text; it is called every few seconds.
 
     Raises:
-        UserError: Pycolmap failed. The error contains the reason.
+        UserError: pycolmap failed; the message gives the reason.
     """
     guard_pycolmap()
     import pycolmap
@@ -94,18 +95,18 @@ def waited(
 
 
 def rows_of(database: Path, table: str) -> int:
-    """Return the number of rows of a table of COLMAP's database, or 0 if it is unknown.
+    """Return the number of rows of a table in COLMAP's database; 0 if unknown.
 
-    The rows are counted in another process. Python's SQLite and pycolmap's SQLite in one process
-    would remove each other's locks, and damage the database
-    (https://sqlite.org/howtocorrupt.html, section 2.2.1).
+    The rows are counted in another process. In one process, Python's SQLite and pycolmap's SQLite
+    would remove each other's locks and damage the database (https://sqlite.org/howtocorrupt.html,
+    section 2.2.1).
     """
     program = [sys.executable, "-I", "-S", "-c", _COUNT, database.absolute().as_uri(), table]
     try:
         done = subprocess.run(program, capture_output=True, timeout=_PATIENCE, check=True)
         return int(done.stdout)
     except (OSError, ValueError, subprocess.SubprocessError):
-        # The database is busy, or does not exist yet.
+        # The database is busy or does not exist yet.
         return 0
 
 
@@ -144,7 +145,7 @@ def is_whole(folder: Path) -> bool:
 
 
 def _has_all(path: Path, record: int) -> bool:
-    """Return True if a file contains as many records as its header says."""
+    """Return True if a file contains as many records as its header states."""
     if not path.is_file():
         return False
     with path.open("rb") as file:

@@ -1,11 +1,10 @@
-"""Second search for poses of photos that mapping left out or probably misplaced, by pairs.
+"""Second search for poses of photos that mapping left out or misplaced.
 
-Mapping adds a photo by those points of the model that the photo shows, and does not check the pose
-again later. A photo may share many features with two photos, but few with a third photo; such a
-photo shows few points of the model. Because of repeated walls and pavements, a photo may get a
-wrong pose at first. Therefore doubtful photos are placed again by means of all their pairs
-(pose_from_pairs.py). Pairs that contradict the poses are disabled, points are triangulated again,
-and mapping continues.
+Mapping adds a photo by the points of the model that the photo shows, and never checks the pose
+again. A photo that shares features with only two other photos shows few points of the model, so
+mapping may leave it out. Repeated walls and pavements can give a photo a wrong pose when it is
+added. Doubtful photos are therefore placed again by all their pairs (pose_from_pairs.py). Pairs
+that contradict the new poses are disabled, points are triangulated again, and mapping continues.
 """
 
 import logging
@@ -27,28 +26,28 @@ if TYPE_CHECKING:
 
 #: Maximum number of rounds over all doubtful photos.
 _ROUNDS: Final = 5
-#: A photo is doubtful if less than the first share of its matches agrees with its pose. Another
-#: pose replaces it if the other pose has at least the second value times as many agreeing matches.
+#: A photo is doubtful if less than the first share of its matches agrees with its pose. Its pose is
+#: replaced if another pose has at least the second value times as many agreeing matches.
 _DOUBTFUL, _BETTER = 0.6, 1.3
-#: Minimum and maximum focal length in photo sizes, and maximum distortion. These are COLMAP's own
-#: limits.
+#: Minimum and maximum focal length in units of the photo size, and maximum distortion. These values
+#: are COLMAP's own limits.
 _POSSIBLE: Final = (0.1, 10.0, 1.0)
 _LOG = logging.getLogger(__name__)
 
 Models: TypeAlias = "list[pycolmap.Reconstruction]"
-#: Function that triangulates the points of a model again and continues mapping. It receives the
-#: folder of the model and the database.
+#: Function that triangulates the points of a model again and continues mapping. Its arguments are
+#: the folder of the model and the database.
 Adjust: TypeAlias = "Callable[[Path, Path], pycolmap.Reconstruction]"
 Poses: TypeAlias = "Mapping[int, pycolmap.Rigid3d]"
 
 
 @dataclass(frozen=True)
 class Look:
-    """The poses of doubtful photos, computed from their pairs.
+    """The result of one search: poses of doubtful photos from their pairs.
 
     Attributes:
-        better: Photo -> a pose with more evidence than its current pose, if there is such a pose.
-        settled: Doubtful photos with a pose, for which no better pose was found.
+        better: Photo -> a pose with more evidence than the photo's current pose.
+        settled: Doubtful photos with a pose for which no better pose was found.
         agreeing: Number of matches that agree with the poses of the model, over all photos.
     """
 
@@ -64,20 +63,21 @@ def looked_again(
     adjust: Adjust,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> tuple[Models, frozenset[int]]:
-    """Return the models after photos of the largest model were placed again by their pairs.
+    """Return the models after doubtful photos of the largest model were placed again.
 
     Args:
-        models: Models of mapping. Photos of smaller models move to the largest model if their poses
-            in it have more evidence.
+        models: The models after mapping. A photo of a smaller model moves to the largest model if
+            its pose there has more evidence.
         database: COLMAP's database with the verified matches.
         scratch: An empty folder.
-        adjust: Function that continues mapping.
-        cancelled: Returns True if the call was cancelled. The function is called for every photo.
+        adjust: Function that triangulates points again and continues mapping.
+        cancelled: Function that returns True if the user cancelled the call; it is called for every
+            photo.
 
     Returns:
-        The models, and the settled photos of the largest model. The largest model is returned in
-        the state in which most matches agree. Settled photos keep their pose because no better pose
-        is known, although some pairs contradict it.
+        The models, and the settled photos of the largest model. Of all rounds, the largest model
+        with the most agreeing matches is returned. Settled photos keep their poses, although some
+        of their pairs contradict them, because no better pose was found.
 
     Raises:
         UserError: The disk is full.
@@ -106,8 +106,8 @@ def looked_again(
             break
         _leave_out_impossible(main)
         look = again.look(main)
-        # Look at all photos again. The evidence for a single photo may no longer be valid after all
-        # photos have moved.
+        # Check all photos again. After many photos have moved, the evidence for a single photo may
+        # have changed.
         if look.agreeing >= seen.agreeing:
             best, seen, gone = main, look, moved
     here = set(best.reg_image_ids())
@@ -118,14 +118,15 @@ def looked_again(
 
 
 class _Again:
-    """A search for better poses in a model.
+    """A search for better poses of the photos in a model.
 
     Args:
-        database: COLMAP's database, which is only read.
-        copy: Path of a copy of the database, made when needed, in which pairs are disabled.
+        database: COLMAP's database, which is not changed.
+        copy: Path of a copy of the database in which pairs are disabled; it is made when it is
+            needed.
         main: The largest model.
         others: The other models.
-        cancelled: Returns True if the call was cancelled.
+        cancelled: Function that returns True if the user cancelled the call.
     """
 
     def __init__(
@@ -143,7 +144,7 @@ class _Again:
         self._aside: frozenset[tuple[int, int]] = frozenset()
 
     def look(self, model: "pycolmap.Reconstruction") -> Look:
-        """Return the evidence on photos that are doubtful in a model or missing from the model."""
+        """Return the evidence for photos that are doubtful in a model or missing from it."""
         with _opened(self._database) as database:
             return self._look(model, self._pairs(model, database), self._elsewhere(database))
 
@@ -177,7 +178,7 @@ class _Again:
         return Look(better, frozenset(settled), agreeing)
 
     def _elsewhere(self, database: "pycolmap.Database") -> dict[int, Support]:
-        """Return the evidence for poses in the other models, and the cameras of these models."""
+        """Return the evidence for poses in the other models, and these models' cameras."""
         evidence = {}
         for model in self._others:
             pairs, poses = Pairs(_cameras_of(model), database), poses_of(model)
@@ -186,9 +187,9 @@ class _Again:
         return evidence
 
     def move(self, model: "pycolmap.Reconstruction", look: Look) -> None:
-        """Place photos, disable pairs that contradict the poses, and enable the other pairs.
+        """Place photos, disable pairs that contradict the poses, and enable all other pairs.
 
-        A photo is left out if too few pairs agree with its pose after all photos are moved.
+        After all photos have moved, a photo is left out if too few pairs agree with its pose.
         """
         if not self.copy.exists():
             # Check the free space first, because SQLite aborts the process on a full disk.
@@ -236,11 +237,11 @@ def _cameras_of(model: "pycolmap.Reconstruction") -> "dict[int, pycolmap.Camera]
 
 
 def _best_known(models: Models, database: "pycolmap.Database") -> "dict[int, pycolmap.Camera]":
-    """Return each camera as refined by the first model that contains it, or else a guess.
+    """Return each camera from the first model that contains it, or an initial guess.
 
-    Without EXIF, a focal length is guessed from the size of the photos. Mapping has refined the
-    same guess for other cameras; the median of these refinements is applied. With a wrong focal
-    length, poses have large errors, and bundle adjustment does not always correct them.
+    Without EXIF, the focal length is guessed from the size of the photos. Mapping has refined such
+    a guess for other cameras; the median of these refinements is applied. With a wrong focal
+    length, poses have large errors, which bundle adjustment does not always correct.
     """
     cameras: dict[int, pycolmap.Camera] = {}
     for model in models:
@@ -276,7 +277,10 @@ def _place(
     photo: int,
     pose: "pycolmap.Rigid3d",
 ) -> None:
-    """Set the pose of a photo in a model. Photo and camera are added if they are missing."""
+    """Set the pose of a photo in a model.
+
+    If the model does not contain the photo or its camera, they are added.
+    """
     import pycolmap
 
     image = database.read_image(photo)

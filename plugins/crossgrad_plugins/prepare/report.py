@@ -1,4 +1,4 @@
-"""The report on a prepared scene: as data, as text, and as a picture."""
+"""The report about a prepared scene: as data, as text, and as a figure."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -19,9 +19,9 @@ from crossgrad_plugins.prepare.matching import Link
 from crossgrad_plugins.prepare.plan import Plan
 from crossgrad_plugins.prepare.results import Result
 
-#: Version of report.json.
+#: Version of the format of report.json.
 FORMAT: Final = 1
-#: Maximum number of printed lines of one kind. The files contain all lines.
+#: Maximum number of lines of one kind that are printed. The files of the report contain all lines.
 _SHOWN: Final = 8
 
 
@@ -31,11 +31,11 @@ class Report:
 
     Attributes:
         plan: Photos and settings.
-        features: Name -> number of features.
-        links: Pairs with verified matches.
-        result: Content of the scene.
-        ways: Method that chose photos to compare, and method that found poses.
-        misplaced: Name of a photo that was taken out of a model -> its matches for and against its
+        features: Name of a photo -> number of features.
+        links: Pairs of photos with verified matches.
+        result: The models and the position of the scene.
+        ways: Names of the method that chose the pairs and of the method that estimated poses.
+        misplaced: Name of a photo that was removed from a model -> its matches for and against its
             pose.
     """
 
@@ -64,13 +64,13 @@ class Report:
 
     @property
     def bridges(self) -> tuple[BridgeReport, ...]:
-        """The gaps in the scene where photos are missing."""
+        """The gaps in the scene, where additional photos are needed."""
         parts = parts_of(self.plan, [frozenset(part.photos) for part in self.result.parts])
         return bridges_of(self.plan, self.links, parts, self.heights)
 
     @property
     def heights(self) -> dict[str, float]:
-        """Name -> metres above ground, if known."""
+        """Name of a photo -> height above ground, m, if known."""
         return {
             name: height
             for part in reversed(self.result.parts)
@@ -123,7 +123,7 @@ def _folder(report: Report, name: str) -> dict[str, Any]:
 
 
 def summary_lines(report: Report) -> list[str]:
-    """Return the lines that are printed when the scene is finished."""
+    """Return the lines that are printed after the scene is finished."""
     return [*_in_short(report), *_missing(report, _SHOWN)]
 
 

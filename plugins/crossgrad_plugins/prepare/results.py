@@ -1,4 +1,4 @@
-"""The model of the scene: georegistered, and merged with other models that GPS can join."""
+"""The model of the scene: georegistered, and merged with models that GPS connects."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -19,23 +19,23 @@ if TYPE_CHECKING:
     import pycolmap
 
 _FILE: Final = "placed.json"
-#: The height of the ground is this percentile of the heights of the points.
+#: This percentile of the heights of the points is the height of the ground.
 _GROUND: Final = 5.0
 
 
 @dataclass(frozen=True)
 class Part:
-    """A model as mapping found it.
+    """A model after mapping.
 
     Attributes:
         photos: Names of the model's photos.
         points: Number of the model's points.
         error: Mean reprojection error in pixels.
-        unplaced: Reason why the model has no place on Earth. Empty if the model has a place on
+        unplaced: Reason why the model has no position on Earth, or an empty text.
+        joined: True if the model is part of the scene: the largest model, or a model that GPS
+            connects with it.
+        heights: Name of a photo -> height above ground, m; empty if the model has no position on
             Earth.
-        joined: True if the model is in the scene, as the largest model or as a model that GPS joins
-            to it.
-        heights: Name -> metres above ground. Empty if the model has no place on Earth.
     """
 
     photos: tuple[str, ...]
@@ -48,12 +48,13 @@ class Part:
 
 @dataclass(frozen=True)
 class Result:
-    """The content of the scene.
+    """The content of a scene.
 
     Attributes:
-        parts: The models, the largest first.
-        georef: Place of the scene on Earth, as in georef.json, or None if unknown.
-        figures: Registered photos, points, observations and errors of the scene's model.
+        parts: The models, largest first.
+        georef: Position of the scene on Earth, as in georef.json; None if unknown.
+        figures: Number of registered photos, points and observations, and errors, of the scene's
+            model.
     """
 
     parts: tuple[Part, ...]
@@ -62,7 +63,7 @@ class Result:
 
 
 def placed(layout: Layout, plan: Plan, models: "Sequence[pycolmap.Reconstruction]") -> Result:
-    """Georegister the models, merge models that GPS joins, and write the model of the scene.
+    """Georegister the models, merge models that GPS connects, and write the scene's model.
 
     Raises:
         UserError: The disk is full.
@@ -119,7 +120,7 @@ def _part(
 
 
 def _heights(model: "pycolmap.Reconstruction") -> dict[str, float]:
-    """Return metres above ground of each photo, by name, for a model whose z axis points up."""
+    """Return the height above ground of each photo in metres, by name; z must point up."""
     points: NDArray[np.float64] = np.array([point.xyz for point in model.points3D.values()])
     if not len(points):
         return {}
@@ -138,7 +139,7 @@ def _figures(model: "pycolmap.Reconstruction") -> dict[str, float]:
 
 
 def _georef(plan: Plan, placements: Sequence[Placement]) -> dict[str, Any]:
-    """Return the scene's place on Earth: metres east, north and up of the origin."""
+    """Return the position of the scene on Earth: metres east, north and up of the origin."""
     origin = origin_of(plan)
     assert origin is not None
     residuals = {

@@ -18,17 +18,16 @@ from crossgrad_plugins.prepare.pycolmap_calls import check_written, quiet, waite
 if TYPE_CHECKING:
     import pycolmap
 
-#: Number of photos that are undistorted between two checks.
+#: Number of photos that are undistorted between two checks for cancellation.
 _BATCH: Final = 32
 _QUALITY: Final = 95
-#: Assumed number of bytes per pixel of a photo on the disk, and assumed number of bytes of other
-#: files except the model. A sharp JPEG photo of this quality needs 0.4 bytes per pixel, and pure
-#: noise needs 2.
+#: Estimated number of bytes per pixel of a written photo, and of all other files except the model.
+#: A sharp JPEG photo of this quality needs 0.4 bytes per pixel; an image of pure noise needs 2.
 _BYTES_PER_PIXEL, _BESIDE = 1.0, 2**18
 
 
 def write_scene(layout: Layout, plan: Plan, threads: int) -> None:
-    """Write the undistorted photos and their masks, and then the model.
+    """Write the undistorted photos and masks, and then the model.
 
     Raises:
         UserError: The disk is full, or pycolmap failed.
@@ -61,9 +60,9 @@ def write_scene(layout: Layout, plan: Plan, threads: int) -> None:
 def _room(
     layout: Layout, plan: Plan, model: "pycolmap.Reconstruction", names: Sequence[str]
 ) -> int:
-    """Return the bytes needed for the undistorted photos of these names and for the model.
+    """Return the free bytes that are needed for these undistorted photos and the model.
 
-    The space is checked in advance, because the JPEG writer aborts the process on a full disk.
+    They are checked in advance, because the JPEG writer aborts the process on a full disk.
     """
     import pycolmap
 
@@ -100,7 +99,7 @@ def _options(plan: Plan) -> "pycolmap.UndistortCameraOptions":
 
 
 def _moved(here: Path, there: Path) -> None:
-    if not _is_written(here):  # Pycolmap does not report the reason.
+    if not _is_written(here):  # pycolmap does not report why a file is missing.
         raise UserError(
             "an undistorted photo could not be written",
             where=there,
@@ -112,9 +111,9 @@ def _moved(here: Path, there: Path) -> None:
 
 
 def _is_written(photo: Path) -> bool:
-    """Return True if a photo file exists and is complete."""
-    # If the JPEG writer cannot write a file, it aborts the process, so an existing JPEG file is
-    # complete. Files in other formats may be truncated.
+    """Return True if the file of a photo exists and is complete."""
+    # The JPEG writer aborts the process if it cannot write, so an existing JPEG file is complete.
+    # Files in other formats may be truncated.
     if not photo.is_file() or photo.suffix.lower() in {".jpg", ".jpeg"}:
         return photo.is_file()
     try:
@@ -125,7 +124,7 @@ def _is_written(photo: Path) -> bool:
 
 
 def _write_masks(layout: Layout, plan: Plan, model: "pycolmap.Reconstruction") -> None:
-    """Write undistorted masks of the photos that have a mask or transparent pixels."""
+    """Write the undistorted masks of photos with a mask or with transparent pixels."""
     import pycolmap
     from PIL import Image
 

@@ -1,12 +1,12 @@
-"""The speed of each rasterizer on a device, available without an import of the rasterizers.
+"""The speed of each rasterizer on a device, for lists that do not import the rasterizers.
 
-The entry points of the group `crossgrad.rasterizers.speed` name these functions. The scale is
-defined by `Rasterizer.speed`.
+These functions are the entry points of the group `crossgrad.rasterizers.speed`. `Rasterizer.speed`
+defines the scale.
 """
 
 from typing import Final
 
-#: The modules of gswarp and of the package that it requires.
+#: The module of gswarp, and the module of the package that gswarp requires.
 GSWARP_PACKAGES: Final = ("gswarp", "warp")
 
 
@@ -31,14 +31,14 @@ def torch(device: str) -> float:
 
 
 def gsplat_missing() -> str:
-    """Return gsplat's missing requirement and how to install it; empty if nothing is missing."""
+    """Return what gsplat lacks and how to install it; empty if nothing is missing."""
     from crossgrad_plugins.rasterizers.gpu.missing import compiler_missing, package_missing
 
     return package_missing("gsplat") or compiler_missing("gsplat") or ""
 
 
 def gswarp_missing() -> str:
-    """Return gswarp's missing requirement and how to install it; empty if nothing is missing."""
+    """Return what gswarp lacks and how to install it; empty if nothing is missing."""
     from crossgrad_plugins.rasterizers.gpu.missing import package_missing
 
     return package_missing(*GSWARP_PACKAGES) or ""

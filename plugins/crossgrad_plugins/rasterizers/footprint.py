@@ -1,9 +1,10 @@
-"""The pixels that a Gaussian may touch: an option of crossgrad's own rasterizers."""
+"""The option `footprint` of crossgrad's own rasterizers: the pixels that a Gaussian may touch."""
 
 from typing import Literal, TypeAlias
 
-#: `alpha`: all pixels with alpha >= 1/255. `3-sigma`: only the pixels in 16 x 16 tiles that overlap
-#: a square of ceil(3 standard deviations) around the mean (3DGS, recipe `published`).
+#: `alpha` allows all pixels with alpha >= 1/255. `3-sigma` allows only pixels in 16 x 16 tiles that
+#: overlap a square of ceil(3 standard deviations) around the mean, as in 3DGS and recipe
+#: `published`.
 Footprint: TypeAlias = Literal["alpha", "3-sigma"]
 
 DESCRIPTION = (

@@ -1,4 +1,4 @@
-"""gsplat's rasterizer: CUDA; several views of the same size are rendered in one call."""
+"""gsplat's rasterizer: CUDA; several views of one size are rendered in one call."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -31,7 +31,9 @@ _GEOMETRY = ("means", "quats", "scales", "opacities")
 
 
 class GsplatRasterizer(Rasterizer):
-    """Renders with the package gsplat (Apache-2); docs/rasterizers.md lists its different rules.
+    """Renders with the package gsplat (Apache-2).
+
+    docs/rasterizers.md lists the rules in which gsplat differs from crossgrad.
 
     Source: Ye et al. 2024 (gsplat, arXiv 2409.06765).
     """
@@ -102,7 +104,7 @@ class GsplatRasterizer(Rasterizer):
         backgrounds: Sequence[Tensor],
         outputs: frozenset[str],
     ) -> list[Render]:
-        """Return the renders of K views of one size, with N Gaussians each, in one call."""
+        """Return the renders of K views of one size with N Gaussians each, in one call."""
         gaussians, camera = views[0]
         if not len(gaussians):
             return [
@@ -118,7 +120,7 @@ class GsplatRasterizer(Rasterizer):
             )
             for view_gaussians, _ in views
         ]
-        # The Gaussians of each view form their own batch, so that the gradients of the views stay
+        # Each view gets a separate batch of Gaussians, so that the gradients of the views stay
         # separate.
         tensors = [
             _batch([getattr(view_gaussians, name) for view_gaussians, _ in views])
@@ -151,12 +153,12 @@ class GsplatRasterizer(Rasterizer):
 
 
 def _batch(tensors: Sequence[Tensor]) -> Tensor:
-    """Return [K, ...] of K tensors; if there is only one tensor, it is not copied."""
+    """Return a batch [K, ...] of K tensors; a single tensor is not copied."""
     return tensors[0][None] if len(tensors) == 1 else torch.stack(list(tensors))
 
 
 def _colors(gaussians: Gaussians, camera: Camera) -> Tensor:
-    """Return [N, 3] RGB as `view_colors` does; harmonics above degree 0 use one kernel."""
+    """Return [N, 3] RGB like `view_colors`, but evaluate SH above degree 0 in one kernel."""
     center = camera.center.to(gaussians.means, non_blocking=True)
     coefficients = coefficients_of(gaussians) if gaussians.colors is None else None
     if coefficients is None or not gaussians.sh_degree:
@@ -170,7 +172,7 @@ def _colors(gaussians: Gaussians, camera: Camera) -> Tensor:
 
 
 def _cameras(cameras: Sequence[Camera], like: Tensor) -> dict[str, Tensor]:
-    """Return poses [K, 1, 4, 4] and intrinsics [K, 1, 3, 3], copied in one transfer."""
+    """Return poses [K, 1, 4, 4] and intrinsics [K, 1, 3, 3], copied together to the device."""
     poses = torch.stack([camera.world_to_camera.reshape(-1) for camera in cameras])
     matrices = torch.stack([camera.matrix.reshape(-1) for camera in cameras])
     both = torch.cat([poses, matrices], 1).to(like, non_blocking=True)

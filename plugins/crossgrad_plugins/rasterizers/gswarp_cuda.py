@@ -1,4 +1,7 @@
-"""gswarp's rasterizer: NVIDIA Warp, which contains a compiler, so only a driver is required."""
+"""gswarp's rasterizer, which uses NVIDIA Warp.
+
+Warp contains a compiler, so only a GPU driver is required.
+"""
 
 from collections.abc import Sequence
 from functools import partial
@@ -24,14 +27,16 @@ from crossgrad_plugins.rasterizers.gpu.nested import Call, Drawing, drawn, empty
 from crossgrad_plugins.rasterizers.gpu.self_test import self_test
 from crossgrad_plugins.rasterizers.reference.harmonics import coefficients_of, view_colors
 
-#: gswarp does not render Gaussians that are nearer than this depth, in the units of its input.
+#: gswarp omits Gaussians that are nearer than this depth, in the units of its input.
 _NEAR = 0.2
 
 
 class GswarpRasterizer(Rasterizer):
-    """Renders with the package gswarp (Apache-2); docs/rasterizers.md lists its different rules.
+    """Renders with the package gswarp (Apache-2).
 
-    gswarp's near plane is fixed. The scene is scaled so that this plane is at the depth `near`.
+    docs/rasterizers.md lists the rules in which gswarp differs from crossgrad. The near plane of
+    gswarp cannot be changed. Therefore the scene is scaled so that this plane is at the depth
+    `near`.
     """
 
     provides: ClassVar[frozenset[str]] = frozenset({"depth"})
@@ -68,7 +73,7 @@ class GswarpRasterizer(Rasterizer):
 
     @hookimpl
     def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
-        """Return objections if a package is missing or the selection is not supported."""
+        """Return objections if a package is missing or gswarp does not support the selection."""
         if selection.device not in self.devices:
             return []
         reasons = []
@@ -127,7 +132,7 @@ class GswarpRasterizer(Rasterizer):
 
 
 def _colors(gaussians: Gaussians, camera: Camera, degree: int) -> Tensor:
-    """Return [N, 3] RGB, or [N, (degree + 1)^2, 3] coefficients for gswarp's own kernel."""
+    """Return [N, 3] RGB, or [N, (degree + 1)^2, 3] SH coefficients for gswarp's kernel."""
     coefficients = coefficients_of(gaussians) if degree else None
     if coefficients is not None:
         return coefficients
@@ -135,9 +140,9 @@ def _colors(gaussians: Gaussians, camera: Camera, degree: int) -> Tensor:
 
 
 def settings_of(camera: Camera, background: Tensor, enlarged: float, degree: int) -> dict[str, Any]:
-    """Return the fields of gswarp's settings for a camera of a scene that is enlarged by a factor.
+    """Return gswarp's settings for a camera of a scene that is scaled by a factor.
 
-    Above degree 0, gswarp itself evaluates the harmonics. The matrices of gswarp are transposed.
+    Above degree 0, gswarp itself evaluates spherical harmonics. gswarp expects transposed matrices.
     The projection maps the image to [-1, 1] and includes the principal point.
     """
     pose = camera.world_to_camera.clone()
@@ -183,7 +188,7 @@ def _draw(screen: Screen, settings: dict[str, Any], tensors: Sequence[Tensor]) -
 def _observe(screen: Screen, half: tuple[float, float], _centers: Tensor, gradient: Tensor) -> None:
     """Store the gradient [N, 3] with respect to the projected means.
 
-    It is converted from NDC units to pixels.
+    The gradient is converted from NDC units to pixels.
     """
     along = zip(gradient[:, :2].unbind(1), half, strict=True)
     screen.mean_gradient = torch.stack([component / side for component, side in along], dim=1)

@@ -1,4 +1,4 @@
-"""The CPU rasterizer: tiles and a hand-written backward pass.
+"""The CPU rasterizer: it renders tile by tile, with a hand-written backward pass.
 
 The results have the same bits for any number of cores.
 """
@@ -37,7 +37,10 @@ _INPUTS = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest"
 
 
 class NumbaRasterizer(Rasterizer):
-    """Renders float32 Gaussians on the CPU; kernels are compiled once and cached on disk."""
+    """Renders float32 Gaussians on the CPU.
+
+    Kernels are compiled once and cached on disk.
+    """
 
     provides: ClassVar[frozenset[str]] = frozenset(
         {"depth", "pixels", "abs_gradient", "directions", "count"}
@@ -78,7 +81,7 @@ class NumbaRasterizer(Rasterizer):
 
 
 class _Call:
-    """The values that autograd must pass in addition to tensors."""
+    """The values besides tensors that autograd must pass to the backward pass."""
 
     def __init__(
         self,
@@ -101,7 +104,7 @@ class _Call:
 
 
 def _require_fitting(gaussians: Gaussians) -> None:
-    """Raise an error for tensors of inconsistent shapes, because kernels do not check bounds."""
+    """Raise an error for inconsistent shapes, because the kernels do not check bounds."""
     if misfit := gaussians.misfit():
         raise UserError(
             "the Gaussians of the backbone cannot be rendered",
@@ -140,7 +143,7 @@ def _arrays(gaussians: Gaussians) -> GaussianArrays:
 
 
 def _counter(frame: Frame) -> Callable[[Tensor], Tensor]:
-    """Return the function for `Screen.count`, which does not keep the frame's images alive."""
+    """Return the function for `Screen.count`, without keeping the frame's images in memory."""
     drawn = frame.projected, frame.lists, frame.masks, frame.options
 
     def count(marked: Tensor) -> Tensor:
@@ -220,7 +223,7 @@ class _Draw(torch.autograd.Function):
 def _gradient(
     gaussians: GaussianArrays, rows: Tensor | None, name: str, array: NDArray[np.float32] | None
 ) -> Tensor | None:
-    """Return the gradient of one input, as sparse rows if sparse rows were requested."""
+    """Return the gradient of one input, as sparse rows if they were requested."""
     if array is None:
         return None
     values = torch.from_numpy(array)

@@ -1,4 +1,4 @@
-"""The readable rasterizer: plain PyTorch, any device, float32 or float64, gradients by autograd."""
+"""The readable rasterizer: plain PyTorch, any device, float32 or float64, autograd gradients."""
 
 from dataclasses import replace
 from typing import ClassVar
@@ -25,16 +25,16 @@ from crossgrad_plugins.rasterizers.reference.harmonics import view_colors
 from crossgrad_plugins.rasterizers.reference.projection import Projection, Shape, project, shape
 from crossgrad_plugins.rasterizers.reference.statistics import Recorder, longest_axes, recorded
 
-#: Number of standard deviations, and lower bound of the squared half difference of the variances
-#: (px^4).
+#: Number of standard deviations of the published radius, and lower bound of the squared half
+#: difference of the variances (px^4).
 SIGMAS, LEAST_SPREAD = 3.0, 0.1
 
 
 def published_radii(projection: Projection, dilation: float) -> Tensor:
-    """Return [N] half-sides of the squares, whole pixels; 0 if there is no inverse covariance.
+    """Return [N] half sides of the squares in whole pixels; 0 without an inverse covariance.
 
     Source: diff-gaussian-rasterization, radius = ceil(3 sqrt(lambda_max)) with lambda_max = mid +
-    sqrt(max(0.1, mid^2 - det)).
+    sqrt(max(0.1, mid^2 - det)); mid is half the trace of the covariance.
     """
     xx, yy = projection.xx + dilation, projection.yy + dilation
     det = projection.det + dilation * (projection.xx + projection.yy) + dilation**2
@@ -48,8 +48,8 @@ def published_radii(projection: Projection, dilation: float) -> Tensor:
 def square_boxes(means: Tensor, radii: Tensor, size: tuple[int, int]) -> Tensor:
     """Return [N, 4] int64 tile boxes (x0, y0, x1, y1) that squares around `means` overlap.
 
-    Ends are excluded. Pixels are numbered from the centre of the first pixel. A box is empty if the
-    radius is 0 or if the square is outside the image.
+    The ends x1 and y1 are excluded. Pixel coordinates start at the centre of the first pixel. A box
+    is empty if its radius is 0 or its square is outside the image.
     """
     tiles = torch.tensor([-(-pixels // TILE) for pixels in size]).to(means, non_blocking=True)
     middle = torch.where(radii[:, None] > 0, means, 0.0) - 0.5
@@ -60,7 +60,7 @@ def square_boxes(means: Tensor, radii: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def common_tiles(boxes: Tensor, others: Tensor) -> Tensor:
-    """Return [N, 4] the intersections of tile boxes; an empty intersection ends where it starts."""
+    """Return [N, 4] intersections of tile boxes; an empty intersection has equal start and end."""
     first = torch.maximum(boxes[:, :2], others[:, :2])
     last = torch.minimum(boxes[:, 2:], others[:, 2:])
     return torch.cat([first, torch.maximum(first, last)], -1)
@@ -70,9 +70,9 @@ _LARGEST_RADIUS = 2.0**30
 
 
 class TorchRasterizer(Rasterizer):
-    """Renders Gaussians by the common rule set, in the data type of their means.
+    """Renders Gaussians by crossgrad's common rules, in the data type of their means.
 
-    Fast rasterizers are tested against this rasterizer, so the code is short rather than fast.
+    Fast rasterizers are tested against this one, so its code is short instead of fast.
     """
 
     provides: ClassVar[frozenset[str]] = frozenset(
@@ -99,8 +99,8 @@ class TorchRasterizer(Rasterizer):
         size = (camera.width, camera.height)
         with torch.no_grad():
             index, boxes, published = self._drawn(gaussians, camera)
-        # Gaussians that are not rendered are left out of the graph, so that they cannot pass on a
-        # NaN.
+        # Gaussians that are not rendered are left out of the graph, so that a NaN in their values
+        # has no effect.
         drawn = _rows(gaussians, index)
         projection, shapes, colors = self._splats(drawn, camera)
         screen = Screen(torch.zeros(len(gaussians), dtype=torch.int32, device=index.device))
@@ -138,9 +138,10 @@ class TorchRasterizer(Rasterizer):
         return projection, shapes, view_colors(gaussians, eye)
 
     def _drawn(self, gaussians: Gaussians, camera: Camera) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Return the Gaussians to draw, front to back, their tile boxes [V, 4], and their radii.
+        """Return the Gaussians to draw, from front to back, their tile boxes [V, 4], and radii.
 
-        The radii [N] int32 are the published radii, or None unless the footprint is `3-sigma`.
+        The radii [N] int32 are the published radii; they are None unless the footprint is
+        `3-sigma`.
         """
         projection, shapes, colors = self._splats(gaussians, camera)
         table = splat_table(projection.means, projection.depths, colors, shapes)
@@ -170,7 +171,7 @@ class TorchRasterizer(Rasterizer):
 
 
 def _rows(gaussians: Gaussians, index: Tensor) -> Gaussians:
-    """Return the Gaussians at `index` [V]."""
+    """Return the Gaussians at the indices `index` [V]."""
     names = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
     tensors = {name: getattr(gaussians, name) for name in names}
     rows = {name: tensor[index] for name, tensor in tensors.items() if tensor is not None}

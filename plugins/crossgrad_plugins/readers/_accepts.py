@@ -1,6 +1,6 @@
-"""Functions that tell which reader accepts a folder; they do not import the readers.
+"""Functions that decide which reader accepts a folder, without an import of the readers.
 
-The entry points of the group `crossgrad.readers.accepts` name these functions.
+These functions are the entry points of the group `crossgrad.readers.accepts`.
 """
 
 import re
@@ -19,19 +19,20 @@ BLENDER_FILE: Final = "transforms_train.json"
 #: The pose file of nerfstudio and of a MatrixCity block, and the key that only MatrixCity uses.
 TRANSFORMS_FILE: Final = "transforms.json"
 _ROTATION: Final = b'"rot_mat"'
-#: Folders that are searched for blocks, and the maximum depth of the search. An example is
-#: small_city/aerial/train/block_1.
+#: Folders that are searched for blocks, such as small_city/aerial/train/block_1, and the maximum
+#: depth of the search.
 _BLOCKS: Final = re.compile(r"aerial|street|train|test|(block|small_city|big_city|bridge).*")
 _DEEPEST: Final = 4
-#: The reconstruction of OpenSfM, and the reconstruction in an OpenDroneMap project.
+#: Paths of the reconstruction in an OpenSfM folder and in an OpenDroneMap project.
 OPENSFM_FILES: Final = ("reconstruction.json", "opensfm/reconstruction.json")
 #: Columns of RealityCapture's CSV.
 NAME_COLUMN: Final = "name"
 POSE_COLUMNS: Final = ("x", "y", "alt", "heading", "pitch", "roll")
 COLUMNS: Final = frozenset({NAME_COLUMN, *POSE_COLUMNS, "f"})
-#: If a file has at least this many of the columns, it is probably meant as a RealityCapture CSV.
+#: A file with at least this many of the columns counts as an incomplete RealityCapture CSV, and
+#: gets a helpful error.
 _NEARLY: Final = 5
-#: Names in UC-GS scenes: the prefix of a folder of held-out photos, and the word in the names of
+#: Names in UC-GS scenes: the prefix of folders of held-out photos, and a word in the names of
 #: held-out photos.
 _TEST: Final = "test"
 _EVAL: Final = re.compile(r"(?<![a-z])eval(?![a-z])")
@@ -40,12 +41,12 @@ _MOST: Final = 10_000
 
 
 def blender(path: Path, folder: str = ".") -> bool:
-    """Return True if the folder holds a NeRF synthetic scene."""
+    """Return True if the folder contains a NeRF synthetic scene."""
     return begins_with(path / folder / BLENDER_FILE, b"{")
 
 
 def colmap(path: Path) -> bool:
-    """Return True if the folder holds a COLMAP model."""
+    """Return True if the folder contains a COLMAP model."""
     try:
         return bool(find_models(path))
     except OSError:
@@ -53,48 +54,48 @@ def colmap(path: Path) -> bool:
 
 
 def matrixcity(path: Path) -> bool:
-    """Return True if the folder is a MatrixCity block or contains such blocks."""
+    """Return True if the folder is a MatrixCity block or contains MatrixCity blocks."""
     return any(holds(path / name, _ROTATION) for name in pose_files(path))
 
 
 def metashape(path: Path, file: str | None = None) -> bool:
-    """Return True if the folder holds a Metashape XML file of cameras."""
+    """Return True if the folder contains Metashape's XML file of cameras."""
     return bool(METASHAPE.find(Inside(path), file))
 
 
 def nerfstudio(path: Path, file: str = TRANSFORMS_FILE) -> bool:
-    """Return True if the folder holds a frames file of nerfstudio or instant-ngp."""
+    """Return True if the folder contains a frames file of nerfstudio or instant-ngp."""
     return begins_with(path / file, b"{") and not holds(path / file, _ROTATION)
 
 
 def opensfm(path: Path, names: Sequence[str] = OPENSFM_FILES) -> bool:
-    """Return True if the folder holds an OpenSfM reconstruction."""
+    """Return True if the folder contains an OpenSfM reconstruction."""
     return any(begins_with(path / name, b"[") for name in names)
 
 
 def photos_alone(path: Path) -> bool:  # noqa: ARG001 - the answer does not depend on the folder
-    """Return False: only `--prepare` reads a folder this way."""
+    """Return False, because only the option `--prepare` selects this reader."""
     return False
 
 
 def realitycapture(path: Path, file: str | None = None) -> bool:
-    """Return True if the folder holds a RealityCapture CSV of camera parameters."""
+    """Return True if the folder contains a RealityCapture CSV of camera parameters."""
     return bool(REALITYCAPTURE.find(Inside(path), file))
 
 
 def uc_gs(path: Path, images: str = "images") -> bool:
-    """Return True if the folder holds a COLMAP model with photo names that mark held-out photos."""
+    """Return True if the folder contains a COLMAP model whose photo names mark held-out photos."""
     return colmap(path) and any(map(is_held_out, _photos_below(path / images)))
 
 
 def pose_files(scene: Path) -> list[str]:
-    """Return the scene's own pose file if there is one, else the pose files of all blocks."""
+    """Return the pose file in the scene's folder, or else the pose files of all blocks."""
     names = [path.relative_to(scene).as_posix() for path in _walk(scene, 0)]
     return [TRANSFORMS_FILE] if TRANSFORMS_FILE in names else sorted(names)
 
 
 def _walk(folder: Path, depth: int) -> Iterator[Path]:
-    """Yield the pose files in a folder and in subfolders that can belong to MatrixCity."""
+    """Yield the pose files in a folder, and in subfolders whose names MatrixCity uses."""
     try:
         inner = [path for path in folder.iterdir() if _BLOCKS.fullmatch(path.name)]
     except OSError:
@@ -107,7 +108,7 @@ def _walk(folder: Path, depth: int) -> Iterator[Path]:
 
 
 def is_held_out(name: str) -> bool:
-    """Return True if UC-GS holds out a photo with this name."""
+    """Return True if a photo with this name is held out in UC-GS scenes."""
     path = PurePosixPath(name)
     folders = (folder.lower() for folder in path.parts[:-1])
     named = _EVAL.search(path.name.lower()) is not None
@@ -115,7 +116,7 @@ def is_held_out(name: str) -> bool:
 
 
 def _photos_below(images: Path) -> Iterator[str]:
-    """Yield names of photos in a folder, at most two folders deep and at most `_MOST` names."""
+    """Yield at most `_MOST` names of photos in a folder, at most two folders deep."""
     paths = (path for pattern in ("*.*", "*/*.*", "*/*/*.*") for path in images.glob(pattern))
     try:
         for _, path in zip(range(_MOST), paths, strict=False):
@@ -139,16 +140,16 @@ def _has_most_columns(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of camera file.
+    """A kind of file with camera parameters.
 
     Attributes:
         form: Format of the file, such as XML.
-        program: Program that writes the file.
+        program: Name of the program that writes the file.
         suffix: Suffix of the file name, with the dot.
-        holds: Function that returns whether a file is of this kind, from the first bytes of the
-            file.
+        holds: Function that returns True if the first bytes of a file belong to this kind.
         expected: Description of a correct file, for error messages.
-        nearly: Function that returns whether a file is almost of this kind.
+        nearly: Function that returns True if a file is probably meant as this kind but is
+            incomplete.
     """
 
     form: str
@@ -159,19 +160,19 @@ class Kind:
     nearly: Callable[[Path], bool] = lambda _: False
 
     def find(self, inside: Inside, named: str | None) -> list[Path]:
-        """Return the files of this kind: only the named file, or all in the scene's own folder."""
+        """Return the files of this kind: the named file, or all files in the scene's folder."""
         files = self._files(inside) if named is None else [inside.scene / named]
         return list(filter(self.holds, files))
 
     def find_near(self, inside: Inside) -> list[Path]:
-        """Return the files in the scene's own folder that are almost of this kind."""
+        """Return the files in the scene's folder that are incomplete files of this kind."""
         return list(filter(self.nearly, self._files(inside)))
 
     def _files(self, inside: Inside) -> list[Path]:
         return [path for path in inside.files("*") if path.suffix.lower() == self.suffix]
 
     def one(self, inside: Inside, named: str | None) -> Path:
-        """Return the file named by `reader.file`, else the only file (almost) of this kind.
+        """Return the file that `reader.file` names, or else the only file of this kind.
 
         Raises:
             UserError: There is no such file, there are several, or the name leads out of the scene.

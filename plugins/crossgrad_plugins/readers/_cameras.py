@@ -1,4 +1,4 @@
-"""Poses and lenses of other programs, converted to COLMAP's conventions."""
+"""Poses and lenses of other programs, converted to the conventions of COLMAP."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ def from_opengl(
 
     Args:
         rotation: [3, 3] rotation from the camera to the source frame.
-        center: [3] camera centre in the source frame.
+        center: [3] camera centre in the source frame, in which the other program gives poses.
         frame: Transform from the source frame to the world.
     """
     return from_opencv(rotation @ _OPENGL, center, frame)
@@ -37,7 +37,7 @@ def from_opengl(
 def from_opencv(
     rotation: NDArray[np.float64], center: NDArray[np.float64], frame: Frame3D = SAME
 ) -> NDArray[np.float64]:
-    """Return the pose as `from_opengl` does, for OpenCV's axes: x right, y down, z forward."""
+    """Return the pose [4, 4] of a camera with OpenCV's axes: x right, y down, z forward."""
     pose = np.eye(4)
     pose[:3, :3] = (frame.rotation @ rotation).T
     pose[:3, 3] = -pose[:3, :3] @ frame.points(center[None])[0]
@@ -46,7 +46,7 @@ def from_opencv(
 
 @dataclass(frozen=True, eq=False)
 class Frame(Pinhole):
-    """Image size, focal lengths and principal point of a lens, without its distortion."""
+    """Image size, focal lengths and principal point of a camera, without lens distortion."""
 
     @property
     def params(self) -> tuple[float, float, float, float]:
@@ -54,9 +54,10 @@ class Frame(Pinhole):
         return self.fx, self.fy, self.cx, self.cy
 
     def brown(self, radial: Sequence[float], tangential: Sequence[float]) -> Calibration:
-        """Return the calibration with Brown's distortion, in OpenCV's terms k1, k2, k3, p1, p2.
+        """Return the calibration with Brown's distortion k1, k2, k3, p1, p2, as named by OpenCV.
 
-        The simplest COLMAP model that has all terms is used: a pinhole if all terms are zero.
+        The simplest COLMAP model with all non-zero terms is used, and a pinhole if all terms are
+        zero.
         """
         k1, k2, k3 = radial
         params = (*self.params, k1, k2, *tangential)
@@ -86,7 +87,7 @@ def refuse_lens(kind: str, where: object, todo: str = _CUT) -> UserError:
 
 
 def refuse_term(term: str, value: float, where: object) -> UserError:
-    """Return the error for a lens term that COLMAP's models do not contain."""
+    """Return the error for a lens term that no camera model of COLMAP has."""
     return UserError(
         f"the lens model has a term that crossgrad cannot undistort: {term}",
         where=where,

@@ -1,4 +1,4 @@
-"""The first bytes of a file, and the header of a table: its line, separator and columns."""
+"""The first bytes of a file, and the header of a table: its line, separator and column names."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,9 +22,10 @@ class Columns:
 
     @classmethod
     def of(cls, path: Path, known: frozenset[str]) -> "Columns":
-        """Return the columns of a file, from the line that contains most of the known names.
+        """Return the columns of a file.
 
-        Only the first bytes of the file are searched. Comments may precede the header line.
+        The header is the line that contains most of the known names. Only the first bytes of the
+        file are searched. Comments may precede the header line.
         """
         head = head_of(path)
         wide = head.startswith((b"\xff\xfe", b"\xfe\xff"))
@@ -35,7 +36,7 @@ class Columns:
 
 
 def column_names(cells: list[str]) -> tuple[str, ...]:
-    """Return the column names in the cells of a header, without empty names at the end."""
+    """Return the column names in a header, without empty names at the end."""
     names = [cell.strip(' "\r\ufeff').lstrip("#").strip().lower() for cell in cells]
     while names and not names[-1]:
         names.pop()
@@ -43,7 +44,7 @@ def column_names(cells: list[str]) -> tuple[str, ...]:
 
 
 def head_of(path: Path) -> bytes:
-    """Return the first bytes of a file, or no bytes if it is missing or cannot be read."""
+    """Return the first bytes of a file; none if the file is missing or unreadable."""
     try:
         if not path.is_file():
             return b""
@@ -54,7 +55,7 @@ def head_of(path: Path) -> bytes:
 
 
 def begins_with(path: Path, sign: bytes) -> bool:
-    """Return True if a file begins with `sign`, after a byte order mark and white space."""
+    """Return True if a file begins with `sign`; a byte order mark and spaces are skipped."""
     return head_of(path).removeprefix(b"\xef\xbb\xbf").lstrip().startswith(sign)
 
 

@@ -13,11 +13,11 @@ from crossgrad_core.scene.wording import name_some
 
 @dataclass(frozen=True)
 class Labelled:
-    """A camera, identified by its label.
+    """A camera as a file describes it.
 
     Attributes:
-        label: Label as in the file. The label may contain folders and may lack the photo's suffix.
-        group: Label of the camera's group, or an empty text.
+        label: Label of the camera; it may contain folders, and may lack the photo's suffix.
+        group: Label of the camera's group; empty without a group.
         sensor: Label of the camera's sensor.
         size: Width and height of the sensor's photos, in pixels.
     """
@@ -37,12 +37,13 @@ class Labelled:
 def paired(
     cameras: Sequence[Labelled], photos: FileNames, folder: Path
 ) -> tuple[list[str], list[str]]:
-    """Return the photo of each camera, or the camera's label if the photo is missing, and notes.
+    """Return for each camera its photo, or its label if the photo is missing, and notes.
 
-    A label can match photos in several folders. The photo is then chosen by folders named in the
-    label, by the label of the group and by the label of the sensor. If several photos remain, the
-    photo's size and the photos of other cameras decide. The last criterion is the order, if the
-    number of groups or sensors equals the number of folders.
+    A label can match photos in several folders. Of these photos, one is chosen by the folders in
+    the label, by the label of the group, and by the label of the sensor. If several photos are
+    left, the size of the photo and the photos of other cameras are compared. If still several are
+    left, groups or sensors are paired with folders by their order, which needs equal numbers of
+    both.
 
     Args:
         cameras: All cameras, in the order of the file.
@@ -84,7 +85,7 @@ def paired(
 
 
 def _candidates(camera: Labelled, photos: FileNames, folder: Path) -> list[str]:
-    """Return the photos that match the label, reduced by folder names and photo size."""
+    """Return the photos that match the label, its folder names and the photo size."""
     names = photos.fitting(camera.label)
     for hints in (PurePosixPath(camera.label).parts[:-1], (camera.group,), (camera.sensor,)):
         names = _in_folders(names, hints) or names
@@ -94,7 +95,7 @@ def _candidates(camera: Labelled, photos: FileNames, folder: Path) -> list[str]:
 
 
 def _in_folders(names: Sequence[str], hints: Sequence[str]) -> list[str]:
-    """Return the names whose folders include all hints."""
+    """Return the names whose folders contain all hints."""
     wanted = {hint.casefold() for hint in hints}
     return [
         name
@@ -109,7 +110,7 @@ def _size_of(photo: Path) -> tuple[int, int]:
 
 
 def _leave_to_others(cameras: Sequence[Labelled], fits: list[list[str]]) -> None:
-    """Remove a photo that belongs to one camera from all other cameras with an equal label."""
+    """If a photo belongs to a camera, remove it from other cameras with the same label."""
     alike: defaultdict[str, set[int]] = defaultdict(set)
     for index, camera in enumerate(cameras):
         alike[PurePosixPath(camera.label).name].add(index)
@@ -130,7 +131,7 @@ def _leave_to_others(cameras: Sequence[Labelled], fits: list[list[str]]) -> None
 
 
 def _is_sure(camera: Labelled, name: str) -> bool:
-    """Return True if the label, the group or the sensor names the folder of a photo."""
+    """Return True if the folder of a photo is named by the label, the group or the sensor."""
     hints = (PurePosixPath(camera.label).parts[:-1], (camera.group,), (camera.sensor,))
     return camera.label == name or any(
         hint and all(hint) and _in_folders([name], hint) for hint in hints
@@ -138,7 +139,7 @@ def _is_sure(camera: Labelled, name: str) -> bool:
 
 
 def _by_order(cameras: Sequence[Labelled], fits: list[list[str]]) -> list[str]:
-    """Pair groups or sensors with folders by order, and return a note if order was needed."""
+    """Pair groups or sensors with folders by their order; return a note if this was needed."""
     unclear = [i for i, names in enumerate(fits) if len(names) > 1]
     folders = sorted({_folder(name) for i in unclear for name in fits[i]})
     for of in ("group", "sensor"):

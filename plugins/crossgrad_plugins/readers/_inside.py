@@ -1,6 +1,6 @@
-"""Names of files within a scene: a name must not lead out of the folder of the scene.
+"""Names of files in a scene, which must not lead out of the scene's folder.
 
-Symbolic links are resolved. docs/reliability.md explains the rule.
+Symbolic links are followed before this check. docs/reliability.md explains the rule.
 """
 
 import os
@@ -24,13 +24,13 @@ from crossgrad_core.scene.photos.file_names import (
 from crossgrad_core.scene.photos.photo_files import walked
 from crossgrad_core.scene.raw import LONGEST_NAME, LONGEST_PART, is_possible_name
 
-#: Folders that only separate training views from held-out views.
+#: Names of folders that only separate training views from held-out views.
 SPLIT_FOLDERS: Final = frozenset({"train", "test", "val"})
 
 
 @dataclass(frozen=True)
 class Inside:
-    """The files of one scene, found by the names that the scene's own files use.
+    """The files of a scene, found by the names in the scene's own files.
 
     Attributes:
         scene: The scene's folder.
@@ -44,30 +44,30 @@ class Inside:
 
     @cached_property
     def _files(self) -> list[str]:
-        """Paths of all files in the scene."""
+        """Paths of all files of the scene."""
         tree = ((PurePosixPath(below), files) for below, _, files in walked(self.scene))
         return [(below / file).as_posix() for below, files in tree for file in files]
 
     @cached_property
     def photos(self) -> FileNames:
-        """The photos of the scene, which can be found by the end of their path."""
+        """The photos of the scene; a photo can be found by the end of its path."""
         return FileNames(name for name in self._files if kind_of(name) == PHOTO)
 
     @cached_property
     def masks(self) -> FileNames:
-        """The masks of the scene, which can be found by the end of their path."""
+        """The masks of the scene; a mask can be found by the end of its path."""
         return FileNames(name for name in self._files if kind_of(name) == MASK)
 
     @cached_property
     def points(self) -> FileNames:
-        """The point files of the scene, which can be found by the end of their path."""
+        """The point files of the scene; a file can be found by the end of its path."""
         return FileNames(name for name in self._files if kind_of(name) == POINTS)
 
     def name(self, text: str, where: object, base: str = "") -> str:
-        """Return a name relative to the scene, from a name relative to its folder `base`.
+        """Convert a name relative to the folder `base` into a name relative to the scene.
 
         Raises:
-            UserError: The name leads out of the scene, or no file can have this name.
+            UserError: The name leads out of the scene, or is not a possible file name.
         """
         if not is_possible_name(text):
             raise _impossible(where, text)
@@ -77,9 +77,9 @@ class Inside:
         return plain
 
     def found(self, text: str, where: object, base: str, files: FileNames) -> str:
-        """Return the result of `name`.
+        """Convert a name as `name` does.
 
-        If the file is missing, search `files` by the end of the path.
+        If there is no such file, search `files` by the end of the path.
 
         Raises:
             UserError: There is no such file, and the name leads out of the scene.
@@ -87,14 +87,14 @@ class Inside:
         plain = self._plain(text, base)
         if plain is None or not is_file(self.scene / plain):
             other = files.find(plain or text)
-            # Return the name with its own suffix and letter case. A later step matches the photo
-            # and writes a note.
+            # Return the name with the suffix and letter case of the pose file. A later step finds
+            # the photo with another suffix or case, and writes a note.
             if other is not None and (plain is None or not same_spelling(plain, other)):
                 return other
         return self.name(text, where, base)
 
     def _plain(self, text: str, base: str) -> str | None:
-        """Return a normalised name relative to the scene, or None if it leads out of the scene."""
+        """Return a normalised name relative to the scene; None if it leads out of the scene."""
         slashed = text.replace("\\", "/")
         for root in (os.path.abspath(self.scene), self._true):
             if slashed.startswith(os.path.join(root, "")):
@@ -104,10 +104,10 @@ class Inside:
         return None if leads_out else plain
 
     def file(self, name: str, where: object) -> Path:
-        """Return the path of a normalised name. The file may be missing, or may be a link.
+        """Return the path of a file with a normalised name.
 
-        Photos and masks do not need this check: the folder of the photos may be anywhere, and a
-        file that is not a photo is refused.
+        The file may be missing, or may itself be a link. This check is not used for photos and
+        masks. Their folder may be anywhere, and files that are not images are refused.
 
         Raises:
             UserError: A folder in the path is a link that leads out of the scene.
@@ -119,7 +119,10 @@ class Inside:
         return path
 
     def files(self, pattern: str) -> list[Path]:
-        """Return the sorted files in the scene's own folder that match, or [] if unreadable."""
+        """Return the matching files in the scene's folder, sorted.
+
+        None if the folder is unreadable.
+        """
         try:
             return sorted(path for path in self.scene.glob(pattern) if path.is_file())
         except OSError:
@@ -149,13 +152,13 @@ def _impossible(where: object, text: str) -> UserError:
 
 
 def shared_folder(names: Iterable[str]) -> str:
-    """Return the first folder that all names share, or `.` if they do not share a folder."""
+    """Return the first folder that is common to all names; `.` if there is none."""
     first = {PurePosixPath(name).parts[:-1][:1] for name in names}
     return first.pop()[0] if len(first) == 1 and first != {()} else "."
 
 
 def place_of(name: str) -> str:
-    """Return a name without the folders that only separate training from held-out views."""
+    """Return a name without folders that only separate training views from held-out views."""
     parts = PurePosixPath(name).parts
     kept = [part for part in parts[:-1] if part.lower() not in SPLIT_FOLDERS]
     return "/".join((*kept, parts[-1]))

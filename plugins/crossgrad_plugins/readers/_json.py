@@ -1,4 +1,4 @@
-"""JSON files of scenes, with limits on size and depth, and typed fields named in errors."""
+"""JSON files of scenes: limits on size and depth, and typed fields that errors name."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -13,9 +13,10 @@ from crossgrad_core.plugin import UserError
 from crossgrad_core.plugin import read_json as json_in
 from crossgrad_core.scene.raw import FARTHEST
 
-#: Largest file in bytes. Large reconstructions contain millions of points.
+#: Maximum size of a file in bytes. The limit is high, because large reconstructions contain
+#: millions of points.
 LARGEST: Final = 512 << 20
-#: Largest width or height of a photo, in pixels.
+#: Maximum width or height of a photo, in pixels.
 LONGEST_SIDE: Final = 10_000_000
 _AGAIN = "correct the file, or export it again"
 _LONGEST: Final = 80
@@ -23,12 +24,15 @@ _LONGEST: Final = 80
 
 @dataclass(frozen=True, eq=False)
 class Fields:
-    """A JSON object. Each getter raises a `UserError` that names the file and the field.
+    """A JSON object whose fields are checked when they are read.
+
+    Each function that returns a field raises a `UserError` with the file and the field if the field
+    is wrong.
 
     Attributes:
-        value: The members of the object.
+        value: The JSON object.
         file: The file that contains the object.
-        place: Path of the object in the file, such as `frames[3]`. Empty for the object at the top.
+        place: Position of the object in the file, such as `frames[3]`; empty for the top object.
     """
 
     value: Mapping[str, object]
@@ -37,18 +41,18 @@ class Fields:
 
     @property
     def here(self) -> str:
-        """The file and the place of the object in the file, for error messages."""
+        """Return the file and the object's position in the file, for error messages."""
         return f"{self.file}: {self.place}"
 
     def where(self, key: str) -> str:
-        """Return the file and the place of a field, for error messages."""
+        """Return the file and the position of a field, for error messages."""
         return f"{self.file}: {self.place}{'.' if self.place else ''}{key}"
 
     def __contains__(self, key: str) -> bool:
         return self.value.get(key) is not None
 
     def wrong(self, key: str, expected: str, found: str | None = None) -> NoReturn:
-        """Raise an error that refuses a field.
+        """Raise an error about a wrong field.
 
         Raises:
             UserError: Always.
@@ -79,7 +83,7 @@ class Fields:
         return number
 
     def side(self, key: str) -> int:
-        """Return the width or height of a photo, a whole number of pixels."""
+        """Return the width or height of a photo as a whole number of pixels."""
         number = self.number(key)
         if number != int(number) or not 1 <= number <= LONGEST_SIDE:
             self.wrong(key, f"a whole number from 1 to {LONGEST_SIDE:,}")
@@ -93,7 +97,7 @@ class Fields:
         return value
 
     def numbers(self, key: str, *shape: int) -> NDArray[np.float64]:
-        """Return finite numbers in nested lists of the given shape."""
+        """Return nested lists of finite numbers with the given shape."""
         flat = list(_flat(self.value.get(key), shape))
         numbers = [number for number in map(_number, flat) if number is not None]
         if len(numbers) != len(flat) or len(flat) != math.prod(shape):
@@ -112,11 +116,11 @@ class Fields:
         return texts
 
     def inner(self, key: str) -> "Fields":
-        """Return an object that is a member of this object."""
+        """Return a field that is an object."""
         return self._child(self.value.get(key), key)
 
     def members(self, key: str) -> dict[str, "Fields"]:
-        """Return the objects in a member that is an object, by their names."""
+        """Return the objects inside a field that is an object, by name."""
         value = self.value.get(key)
         if not isinstance(value, dict):
             self.wrong(key, "an object")
@@ -143,10 +147,10 @@ class Fields:
 
 
 def read_json(path: Path) -> object:
-    """Return the value in a JSON file in UTF-8, with or without a byte order mark.
+    """Return the value of a JSON file in UTF-8, with or without a byte order mark.
 
     Raises:
-        UserError: The file is missing, too large, too deep, or not JSON.
+        UserError: The file is missing, too large, nested too deeply, or not JSON.
     """
     try:
         return json_in(path, LARGEST)
@@ -164,8 +168,8 @@ def read_object(path: Path) -> Fields:
     """Return the object in a JSON file.
 
     Raises:
-        UserError: The file is missing, too large, too deep or not JSON, or does not contain an
-            object.
+        UserError: The file is missing, too large, nested too deeply, not JSON, or does not contain
+            an object.
     """
     value = read_json(path)
     if not isinstance(value, dict):
@@ -180,7 +184,7 @@ def _unreadable(path: Path, found: str, expected: str = "JSON") -> UserError:
 
 
 def _number(value: object) -> float | None:
-    """Return a number that is finite and not too large, else None. Booleans give None."""
+    """Return a number if it is finite and not too large, else None. A boolean value gives None."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     # Compare before the conversion to float, because whole numbers in JSON can have any number of
@@ -189,7 +193,7 @@ def _number(value: object) -> float | None:
 
 
 def _flat(value: object, shape: tuple[int, ...]) -> Iterator[object]:
-    """Yield the values in nested lists of this shape. Skip lists of other lengths."""
+    """Yield the values of nested lists with this shape. Lists of other lengths yield nothing."""
     if not shape:
         yield value
     elif isinstance(value, list) and len(value) == shape[0]:

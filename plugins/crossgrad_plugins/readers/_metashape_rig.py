@@ -1,10 +1,10 @@
-"""Multi-camera systems of Metashape: poses of slave cameras, computed from their masters.
+"""Multi-camera systems of Metashape: poses of slave cameras, computed from master cameras.
 
-A slave camera has no transform of its own. The sensor of a slave camera contains a location and a
-rotation. The location is the slave's centre in the axes of the master, in the units of the chunk.
-The rotation turns the slave's axes into the master's axes. The transform of the slave is therefore
-the transform of the master * [rotation | location]. Source: Metashape Expert Manual, "The
-slave-sensor transform: composition rule",
+A slave camera has no transform. Its sensor contains a location and a rotation instead. The location
+is the slave's centre in the coordinates of the master, in the units of the chunk (Metashape's name
+for a block of photos). The rotation converts the slave's axes into the master's axes. The slave's
+transform is therefore (transform of the master) * [rotation | location]. Source: Metashape Expert
+Manual, "The slave-sensor transform: composition rule",
 https://photogrammetrycommunity.github.io/metashape-expert-manual/workflow/camera-calibration/slave-sensor-transform-recipes/
 """
 
@@ -42,7 +42,7 @@ class Rig:
         """Return the rig of a chunk with these cameras.
 
         Raises:
-            UserError: A transform or an offset is not a rotation and a shift.
+            UserError: A transform or an offset does not consist of a rotation and a translation.
         """
         offsets = {
             sensor.get("id", ""): offset
@@ -58,19 +58,19 @@ class Rig:
         return cls(offsets, transforms, sensors)
 
     def is_slave(self, camera: Element) -> bool:
-        """Return True if the pose of a camera is computed from a master and an offset."""
+        """Return True if a camera's pose is computed from its master."""
         return camera.find("transform") is None and camera.get("master_id") is not None
 
     def pose(self, camera: Element) -> NDArray[np.float64] | None:
-        """Return the pose [4, 4], camera to chunk, or None if transform or offset is missing."""
+        """Return the pose [4, 4], camera to chunk; None if the transform or offset is missing."""
         if not self.is_slave(camera):
             return self.transforms.get(camera.get("id", ""))
         master = camera.get("master_id", "")
         pose, offset = self.transforms.get(master), self.offsets.get(camera.get("sensor_id", ""))
         if pose is None or offset is None:
             return None
-        # The offsets of all sensors refer to one sensor of the rig, which may be any of them.
-        # Convert them to the master camera.
+        # The offsets of a rig refer to one of its sensors, which need not be the master's. Convert
+        # the offset so that it refers to the master camera.
         of_master = self.offsets.get(self.sensors.get(master, ""), _IDENTITY)
         return np.asarray(pose @ np.linalg.inv(of_master) @ offset)
 
@@ -81,7 +81,7 @@ def _transform(element: Element, file: Path, place: str) -> NDArray[np.float64]:
 
 
 def _offset(sensor: Element, file: Path, place: str) -> NDArray[np.float64] | None:
-    """Return the transform [4, 4] from slave to master, or None if the sensor has no offset."""
+    """Return the transform [4, 4] from slave to master; None if the sensor has no offset."""
     location, rotation = sensor.find("location"), sensor.find("rotation")
     if sensor.get("master_id") is None or (location is None and rotation is None):
         return None

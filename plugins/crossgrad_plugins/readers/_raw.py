@@ -1,4 +1,4 @@
-"""Raw scenes for readers of formats with posed photos in a folder and separate points."""
+"""Raw scenes for readers of formats that have posed photos in a folder, and separate points."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -16,21 +16,22 @@ from crossgrad_core.scene.raw import RawScene, RawView
 from crossgrad_plugins.georeference.frames import SAME, Frame3D
 from crossgrad_plugins.readers._inside import Inside, place_of
 
-#: File names that tools use for points next to the poses. The first existing file is read.
+#: File names of points that programs write beside the poses. The first of these files that exists
+#: is read.
 USUAL: Final = ("sparse_pc.ply", "points3D.ply", "points3d.ply", "point_cloud.ply", "points.ply")
 
 
 def raw_scene(
     inside: Inside, images: str, views: tuple[RawView, ...], points: PointCloud, *notes: str
 ) -> RawScene:
-    """Return the scene of some views, without a split or a background of its own.
+    """Return the scene of some views, without lists of held-out views and without a background.
 
     Args:
         inside: The files of the scene.
-        images: Photo folder relative to the scene, `.` for the scene's own folder.
+        images: Folder of the photos relative to the scene; `.` for the scene's own folder.
         views: The posed photos.
-        points: Points in the same frame as the poses.
-        notes: Notes on the actions of the reader.
+        points: Points in the coordinates of the poses.
+        notes: Notes about changes that the reader made.
     """
     return RawScene(
         root=inside.scene,
@@ -46,7 +47,7 @@ def raw_scene(
 def raw_view(
     name: str, calibration: Calibration, pose: NDArray[np.float64], mask: Path | None = None
 ) -> RawView:
-    """Return a view that observes no points. `RawView` describes the arguments."""
+    """Return a view that has observed no points. The arguments are described at `RawView`."""
     seen = np.zeros(0, dtype=np.int64)
     return RawView(name, calibration, pose, seen, mask, place_of(name))
 
@@ -59,15 +60,15 @@ def find_points(
     frame: Frame3D = SAME,
     base: str = "",
 ) -> PointCloud:
-    """Return the points of the named file, or else of a PLY with a usual name, or else no points.
+    """Return the points of the named file, or of a PLY with a common name, or no points.
 
     Args:
-        inside: The scene.
-        options: If the options name a file of points, no points are read here.
-        named: Requested file, relative to `base`.
-        where: Place of the name, for error messages.
+        inside: The files of the scene.
+        options: The reader's options; if they name a file of points, no points are read here.
+        named: Requested file relative to `base`, or None.
+        where: Position of the name, for error messages.
         frame: Transform from the file's frame to the world.
-        base: Folder of the file that names the points.
+        base: Folder of the file that contains the name.
 
     Raises:
         UserError: The named file leads out of the scene, is missing or cannot be read.
@@ -91,21 +92,23 @@ def _placed(points: PointCloud, frame: Frame3D) -> PointCloud:
 
 @dataclass(frozen=True)
 class PhotoNames:
-    """The names that a pose file uses for the photos of a folder.
+    """The names in a pose file of the photos in a folder.
 
     Attributes:
-        files: Name in the pose file -> the only photo in the folder that matches the name.
+        files: Name in the pose file -> the only matching photo in the folder.
     """
 
     files: Mapping[str, str]
 
     @classmethod
     def of(cls, folder: Path, names: Iterable[str]) -> "PhotoNames":
-        """Return the photos in a folder, or no photos if the folder is missing."""
+        """Return the names of the photos in a folder; none if the folder is missing."""
         return cls(PhotoFolder(folder).pair(frozenset(names)).files)
 
     def full(self, name: str, inside: Inside, where: object) -> str:
-        """Return the photo of a name, or the name itself if no photo or several photos match.
+        """Return the photo that a name matches.
+
+        Return the name itself if no photo matches, or if several match.
 
         Raises:
             UserError: No photo matches, and the name leads out of the scene.

@@ -1,8 +1,8 @@
-"""Files like `transforms.json`: frames with a pose in OpenGL's axes, and their lenses.
+"""Files like `transforms.json`: frames with a pose in OpenGL's axes, and lens parameters.
 
-Sources: https://docs.nerf.studio/quickstart/data_conventions.html (fields and axes; pixel centres
-are at +0.5, because COLMAP's principal points are copied), https://github.com/NVlabs/instant-ngp,
-`docs/nerf_dataset_tips.md` (`camera_angle_x`, `rolling_shutter`).
+Sources: https://docs.nerf.studio/quickstart/data_conventions.html for fields and axes;
+https://github.com/NVlabs/instant-ngp, `docs/nerf_dataset_tips.md`, for `camera_angle_x` and
+`rolling_shutter`. Pixel centres are at +0.5, because principal points are copied from COLMAP.
 """
 
 import math
@@ -30,7 +30,7 @@ _PERSPECTIVE: Final = frozenset(
     {"PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"}
 )
 _FISHEYE: Final = frozenset({"OPENCV_FISHEYE", "FISHEYE"})
-#: Pairs of field groups that give the same quantity in two ways.
+#: Pairs of groups of fields; both groups of a pair give one quantity.
 _WAYS: Final = (
     (("fl_x", "fl_y"), ("camera_angle_x", "camera_angle_y")),
     ((*_RADIAL, *_TANGENTIAL), ("distortion_params",)),
@@ -39,13 +39,13 @@ _WAYS: Final = (
 
 @dataclass(frozen=True, eq=False)
 class Posed:
-    """A frame of a file: a photo with its pose.
+    """A photo with its pose: one frame of a file.
 
     Attributes:
         photo: Name of the photo, relative to the scene.
-        calibration: The lens of the photo.
+        calibration: Calibration of the photo's lens.
         pose: [4, 4] world to camera.
-        mask: The mask file of the photo, if the frame names one.
+        mask: The mask file that the frame names, or None.
     """
 
     photo: str
@@ -55,11 +55,13 @@ class Posed:
 
 
 def photo_name(inside: Inside, text: str, where: str, base: str) -> str:
-    """Return the photo that a file names. A name without a suffix means a PNG file, as in NeRF.
+    """Return the photo that a file names.
+
+    A name without a suffix means a PNG file, as in NeRF's files.
 
     Args:
-        inside: The scene.
-        text: The name.
+        inside: The files of the scene.
+        text: The name in the file.
         where: The field that contains the name.
         base: Folder of the file, relative to the scene.
 
@@ -76,15 +78,15 @@ def photo_name(inside: Inside, text: str, where: str, base: str) -> str:
 def read_frame(
     inside: Inside, frame: Fields, whole: Fields, base: str = "", world: Frame3D = SAME
 ) -> Posed:
-    """Return a frame that has `file_path` and `transform_matrix`.
+    """Return a frame from its fields `file_path` and `transform_matrix`.
 
     Args:
-        inside: The scene.
+        inside: The files of the scene.
         frame: The frame.
-        whole: The file, with the fields that all frames share. Fields of the frame take precedence
-            over fields of the file.
+        whole: The whole file, with fields that apply to all frames. A field of the frame overrides
+            the file's field.
         base: Folder of the file, relative to the scene.
-        world: Transform from the file's world frame to the scene's world frame.
+        world: Transform from the world of the file to the world of the scene.
 
     Raises:
         UserError: A field is missing or wrong.
@@ -104,18 +106,19 @@ def read_frame(
 
 
 def transform_of(fields: Fields, key: str) -> NDArray[np.float64]:
-    """Return the first three rows [3, 4] of a matrix with three or four rows."""
+    """Return the first three rows [3, 4] of a matrix that has three or four rows."""
     rows = fields.value.get(key)
     count = 4 if isinstance(rows, list) and len(rows) == 4 else 3  # noqa: PLR2004 - homogeneous
     return fields.numbers(key, count, 4)[:3]
 
 
 def read_lens(inside: Inside, frame: Fields, whole: Fields, photo: str) -> Calibration:
-    """Return the lens of a frame. If the file gives no size, the photo's size is used.
+    """Return the lens parameters of a frame.
 
-    A field of the frame takes precedence over the file's field with the same name. Different fields
-    can give the same quantity. If the frame gives a quantity by one field, the other fields of the
-    file for this quantity are ignored, because they describe another lens.
+    If the file gives no image size, the size of the photo is used. A field of the frame overrides
+    the field of the file with this name. Some quantities can be given by different fields. If the
+    frame gives a quantity, the file's other fields for this quantity are ignored, because they
+    describe another lens.
 
     Raises:
         UserError: A field is missing or wrong, or the lens cannot be undistorted.
@@ -146,20 +149,20 @@ def read_lens(inside: Inside, frame: Fields, whole: Fields, photo: str) -> Calib
 
 
 def _completing(frame: Fields, whole: Fields) -> Fields:
-    """Return the file with only the fields that may complete the fields of a frame."""
+    """Return the file, reduced to the fields that may complete a frame."""
     others = [other for both in _WAYS for way, other in (both, both[::-1])
               if any(key in frame for key in way)]  # fmt: skip
     frame_is_fisheye = _says_fisheye(frame)
     if frame_is_fisheye is not None and frame_is_fisheye != bool(_says_fisheye(whole)):
-        others += _WAYS[1]  # Hide distortion parameters that belong to another kind of lens.
+        others += _WAYS[1]  # Remove distortion parameters of another kind of lens.
     hidden = frozenset[str]().union(*others)
     return replace(whole, value={k: v for k, v in whole.value.items() if k not in hidden})
 
 
 def _says_fisheye(fields: Fields) -> bool | None:
-    """Return True or False if a frame or file declares a lens: True for a fisheye lens.
+    """Return True if the lens is declared as fisheye, False if it is declared as another lens.
 
-    Return None without a lens.
+    Return None if no lens is declared.
     """
     if "camera_model" not in fields and "is_fisheye" not in fields:
         return None
@@ -180,12 +183,16 @@ def _frame(
     holder: Callable[[str], Fields],
     number: Callable[[str, float | None], float],
 ) -> Frame:
-    """Return focal lengths (in pixels or from angles of view) and principal point (or middle)."""
+    """Return focal lengths and principal point.
+
+    Focal lengths can be given in pixels or as angles of view. Without a principal point, the middle
+    of the image is used.
+    """
     width, height = size
     across = _focal(holder, "fl_x", "camera_angle_x", width)
     down = _focal(holder, "fl_y", "camera_angle_y", height)
     if across is None:
-        # The error says that the horizontal focal length is missing.
+        # If both focal lengths are missing, the error names the horizontal one.
         other = "camera_angle_y" if "camera_angle_y" in holder("camera_angle_y") else "fl_y"
         holder(other).wrong("fl_x", "a focal length in pixels, or camera_angle_x in radians")
     return Frame(
@@ -208,7 +215,7 @@ def _focal(holder: Callable[[str], Fields], name: str, angle_name: str, side: in
 def _terms(
     holder: Callable[[str], Fields], number: Callable[[str, float | None], float]
 ) -> tuple[Sequence[float], Sequence[float]]:
-    """Return k1 to k4 and p1, p2, from single fields, or from one list in this order."""
+    """Return k1 to k4, p1 and p2, from single fields or from a list in this order."""
     fields = holder("distortion_params")
     if "distortion_params" in fields:
         terms = fields.numbers("distortion_params", 6).tolist()
@@ -217,7 +224,7 @@ def _terms(
 
 
 def raw_views(frames: Sequence[Posed]) -> tuple[str, tuple[RawView, ...]]:
-    """Return the photo folder (`.` for the scene's own), and the views named relative to it."""
+    """Return the photo folder (`.` for the scene's own), and views named relative to it."""
     images = shared_folder(frame.photo for frame in frames)
     start = 0 if images == "." else len(images) + 1
     return images, tuple(

@@ -1,10 +1,9 @@
-"""XML files of scenes, read with expat under limits, and numbers in their elements.
+"""XML files of scenes, read by expat with limits, and numbers in their elements.
 
-Entities make XML dangerous: they expand without a bound and can name other files. Entities can only
-be declared in a document type. The supported formats use no document type, so a file with a
-document type is refused before its content is read. Size, depth and number of elements are limited
-too, so that a file needs at most about ten times its size in memory. No additional package is
-needed.
+Entities make XML dangerous, because they can expand without a limit and can name other files. Only
+a document type can declare entities. The supported formats have no document type, so a file with a
+document type is refused before its content is read. Size, nesting depth and number of elements are
+limited too, so that reading needs at most about ten times the file's size in memory.
 """
 
 from pathlib import Path
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from crossgrad_core.plugin import UserError, open_file, size_text
 from crossgrad_plugins.readers._json import Fields
 
-#: Limits: bytes of a file, bytes of a tag or a comment, nesting depth, and number of elements and
+#: Limits: bytes of a file, bytes of a tag or comment, nesting depth, and number of elements and
 #: attributes.
 LARGEST: Final = 128 << 20
 _LONGEST: Final = 4 << 20
@@ -29,11 +28,14 @@ _AGAIN = "export the file again"
 
 
 class _RefusedError(Exception):
-    """The file contains something that this reader refuses."""
+    """The error for XML content that this module does not accept."""
 
 
 class _Builder:
-    """Builds a tree from expat's events and refuses XML features that scene formats do not need."""
+    """Builds a tree from expat's events.
+
+    XML features that scene formats do not need are refused.
+    """
 
     def __init__(self) -> None:
         self.tree = TreeBuilder()
@@ -63,7 +65,8 @@ def read_xml(path: Path) -> Element:
     """Return the root element of an XML file.
 
     Raises:
-        UserError: The file is missing, too large or too deep, is not XML, or has a document type.
+        UserError: The file is missing, too large, nested too deeply, not XML, or has a document
+            type.
     """
     try:
         return _parsed(path)
@@ -96,10 +99,10 @@ def _parsed(path: Path) -> Element:
 
 
 def numbers(element: Element | None, count: int, file: Path, place: str) -> NDArray[np.float64]:
-    """Return the numbers [count] in the text of an element.
+    """Return [count] the numbers in the text of an element.
 
     Raises:
-        UserError: The element is missing, or has other content than the expected numbers.
+        UserError: The element is missing, or does not contain the expected numbers.
     """
     words = (element.text or "").split() if element is not None else []
     values: list[object] = []

@@ -1,4 +1,4 @@
-"""Reader of NeRF synthetic scenes, rendered by Blender: `transforms_train.json` and the like."""
+"""Reader of NeRF synthetic scenes, rendered by Blender: `transforms_train.json` and others."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,18 +18,19 @@ from crossgrad_plugins.readers._raw import find_points, raw_scene
 from crossgrad_plugins.readers._transforms import Posed, raw_views, read_frame
 from crossgrad_plugins.readers.colmap_files.folder import check_scene_folder
 
-#: The views of the first existing file are held out. Validation views are not used if the test file
-#: exists.
+#: Files of held-out views; the first file that exists is used. If the test file exists, validation
+#: views are not used.
 _HELD_OUT: Final = ("transforms_test.json", "transforms_val.json")
 _BEHIND: Final = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "none": None}
 
 
 class BlenderReader(Reader):
-    """NeRF synthetic scenes: `transforms_train.json`, `transforms_test.json` and their photos.
+    """NeRF synthetic scenes: `transforms_train.json`, `transforms_test.json` and photos.
 
-    The fields are the fields of nerfstudio's format, mostly only `camera_angle_x`. The alpha
-    channel of a photo is the fraction of a pixel that the object covers. Photos are blended over
-    `reader.background` (white, as in NeRF). `--background` should name the same colour.
+    Fields have the names of nerfstudio's format. Most files only contain `camera_angle_x`. The
+    alpha channel of a photo is the fraction of each pixel that the object covers. Photos are
+    blended over `reader.background` (white, as in NeRF). The option `--background` should give the
+    same colour.
     """
 
     folder: str = Field(".", description="folder of the transforms files within the scene")
@@ -52,7 +53,7 @@ class BlenderReader(Reader):
     def read(self, path: Path, options: SceneOptions) -> Scene:
         check_scene_folder(path)
         inside = Inside(path)
-        # Inside the scene, the scene's own folder has no name.
+        # The scene's own folder is not part of names inside the scene.
         file = inside.name(_accepts.BLENDER_FILE, "reader.folder", self.folder)
         base = file[: -len(_accepts.BLENDER_FILE)]
         train = _read(inside, file, base)

@@ -28,15 +28,14 @@ from crossgrad_plugins.readers.place.place import by_code, by_file, by_gps
 
 #: Name of the file with the georeference, in the model's folder or in the scene's folder.
 _GEOREF = "georef.json"
-#: If a quaternion's length is below this value, or above its inverse, the square of the length is
-#: not accurate.
+#: If the length of a quaternion is outside this value and its inverse, its square is inaccurate.
 _SHORTEST = 1e-100
 
 
 class ColmapReader(Reader):
     """COLMAP scenes (https://colmap.github.io/format.html), with any perspective camera model.
 
-    Photos are paired with poses by their path in the image folder. If there are several models,
+    Photos are matched with poses by their path in the image folder. If there are several models,
     the model with the most registered images is read.
     """
 
@@ -61,10 +60,10 @@ class ColmapReader(Reader):
         return self.placed(build_scene(raw, options), raw)
 
     def placed(self, scene: Scene, raw: RawScene) -> Scene:
-        """Return the scene with its place on Earth if that place is known.
+        """Return the scene with its georeference, if its position on Earth is known.
 
         Raises:
-            UserError: A file named by an option, or a `georef.json`, is missing or unreadable.
+            UserError: A file that an option names, or a `georef.json`, is missing or unreadable.
         """
         if self.crs is not None and self.gps is not None:
             raise UserError(
@@ -85,14 +84,14 @@ class ColmapReader(Reader):
 def read_raw(path: Path, images: str, wanted: str | None, options: SceneOptions) -> RawScene:
     """Return a COLMAP scene as stored in its files.
 
-    If the model has no points, the points come from a PLY in the model's folder, or in a folder
-    above it within the scene.
+    If the model has no points, a PLY is searched in the model's folder and in the folders above it
+    within the scene.
 
     Args:
         path: The scene's folder.
         images: Folder of the photos within the scene.
-        wanted: Folder of the model within the scene, or None for the model with most images.
-        options: If the options name a file of points, no PLY is searched.
+        wanted: Folder of the model within the scene; None for the model with most images.
+        options: The reader's options; if they name a file of points, no PLY is searched.
 
     Raises:
         UserError: There is no model, or a file of the model cannot be read.
@@ -129,7 +128,7 @@ def read_raw(path: Path, images: str, wanted: str | None, options: SceneOptions)
 def _beside(
     scene: Path, model: Path, views: tuple[RawView, ...], options: SceneOptions
 ) -> PointCloud:
-    """Return the points of a PLY in the model's folder, or in a folder above it in the scene."""
+    """Return the points of a PLY in the model's folder, or in a folder above within the scene."""
     from crossgrad_plugins.readers._raw import find_points
 
     inside, base = Inside(scene), Path(os.path.relpath(model, scene))
@@ -171,10 +170,10 @@ def _checked_camera(image: ColmapImage, model: ColmapModel, folder: Path) -> int
 def _find_rows(
     points: NDArray[np.uint64], ids: NDArray[np.uint64], order: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Return the rows of the points with these ids, without ids unknown to the model."""
+    """Return the row of each point id; ids that the model does not contain are left out."""
     if not len(ids):
         return np.zeros(0, dtype=np.int64)
-    # Sort the queries, because searchsorted is then many times faster.
+    # Sort the ids first, because this makes `searchsorted` many times faster.
     points = np.sort(points)
     positions = np.minimum(np.searchsorted(ids, points), len(ids) - 1)
     return np.asarray(order[positions[ids[positions] == points]], dtype=np.int64)

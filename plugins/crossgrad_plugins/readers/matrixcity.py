@@ -1,7 +1,7 @@
-"""Reader of MatrixCity scenes as they are distributed: blocks of `transforms.json` and `rgb/`.
+"""Reader of MatrixCity scenes: blocks with `transforms.json` and `rgb/`, as published.
 
-Source of the format: https://github.com/city-super/MatrixCity, README (NeRF's axes; positions in
-metres; the rotation in `rot_mat` is to be multiplied by 100).
+Source of the format: README of https://github.com/city-super/MatrixCity (NeRF's axes; positions in
+metres; the rotation in `rot_mat` must be multiplied by 100).
 """
 
 from dataclasses import replace
@@ -31,9 +31,9 @@ _PHOTOS: Final = "rgb"
 class MatrixCityReader(Reader):
     """Blocks of MatrixCity: `transforms.json` with `rot_mat` and `frame_index`, and photos.
 
-    Photos are in `rgb/`, or in the folder of the poses. A scene is one block or a folder of
-    several blocks. Blocks are held out if they are in a folder `test`, or if their name ends with
-    `_test`.
+    Photos are in the folder `rgb/`, or in the folder of the pose file. A scene is one block, or a
+    folder that contains several blocks. A block is held out if it is in a folder `test`, or if its
+    name ends with `_test`.
     """
 
     points: str | None = Field(

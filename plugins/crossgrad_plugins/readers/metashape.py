@@ -1,9 +1,9 @@
 """Reader of Agisoft Metashape scenes: Metashape's XML of cameras.
 
-Sources of the format: Metashape Professional, user manual, appendix on camera models (p1 and p2
-are swapped compared with OpenCV; b1 is fx - fy, b2 the skew; the principal point is measured from
-the middle of the photo);
-https://agisoft.freshdesk.com/support/solutions/articles/31000158119. Poses are camera to chunk
+Sources of the format: Metashape Professional, user manual, appendix on camera models;
+https://agisoft.freshdesk.com/support/solutions/articles/31000158119. In Metashape's model, p1 and
+p2 are swapped compared with OpenCV; b1 is fx - fy, and b2 is the skew; the principal point is
+measured from the middle of the photo. Poses are given from camera to chunk (a block of photos),
 with OpenCV's axes.
 """
 
@@ -40,23 +40,22 @@ from crossgrad_plugins.readers.colmap_files.folder import check_scene_folder
 from crossgrad_plugins.readers.place.place import at, by_gps
 
 _TERMS: Final = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
-#: The field for rolling shutter compensation, and the values of the field that mean no
-#: compensation.
+#: The field of rolling shutter compensation, and its values that mean no compensation.
 _ROLLING: Final = "rolling_shutter"
 _OFF: Final = frozenset({"false", "0", "no", "off", "none", "disabled"})
 _GLOBAL: Final = (
     "set its rolling shutter compensation to Disabled (Tools > Camera Calibration), optimize the "
     "cameras, and export them again"
 )
-#: Coordinate systems in which the chunk transform gives geocentric coordinates.
+#: Coordinate systems for which the transform of the chunk gives geocentric coordinates.
 _ON_EARTH: Final = ("GEOGCS", "PROJCS", "GEOCCS", "COMPD_CS")
 
 
 class MetashapeReader(Reader):
-    """Agisoft Metashape's XML of cameras, with photos in a folder and points from a PLY.
+    """Agisoft Metashape's XML of cameras, a folder of photos, and points from a PLY.
 
-    The chunk's transform is applied. If the transform gives geocentric coordinates, cameras are
-    moved to the local frame at their centre: x east, y north, z up, in metres.
+    The transform of the chunk is applied to the poses. Geocentric coordinates are converted to a
+    local frame at the centre of the cameras: x east, y north, z up, in metres.
     """
 
     images: str = Field("images", description="folder of the photos within the scene")
@@ -105,7 +104,10 @@ class MetashapeReader(Reader):
 
 @dataclass(frozen=True, eq=False)
 class _Camera:
-    """A posed camera: label, sensor id, group label, component id, pose and XML attributes."""
+    """A camera with a pose.
+
+    The fields are label, sensor id, group label, component id, pose and XML attributes.
+    """
 
     label: str
     sensor: str
@@ -134,7 +136,7 @@ def _missing(file: Path, what: str) -> UserError:
 
 
 def _cameras(chunk: Element, file: Path) -> tuple[list[_Camera], list[str]]:
-    """Return the posed cameras of the largest component, and notes on the omitted cameras."""
+    """Return the cameras with poses of the largest component, and notes on omitted cameras."""
     holder = chunk.find("cameras")
     if holder is None:
         raise _missing(file, "cameras")
@@ -186,7 +188,7 @@ def _camera(fields: Fields, group: str, component: str, pose: NDArray[np.float64
 def _world(
     chunk: Element, file: Path, cameras: list[_Camera], wanted: str
 ) -> tuple[Frame3D, list[str], OnEarth | None]:
-    """Return the transform from chunk to scene coordinates, notes on it, and the place on Earth."""
+    """Return the transform from chunk to scene, notes on it, and the scene's position on Earth."""
     frame, name = _transform(chunk, file, cameras[0].component if cameras else "")
     if name is None or not cameras:
         return SAME, [], None
@@ -205,9 +207,9 @@ def _world(
 
 
 def _transform(chunk: Element, file: Path, component: str) -> tuple[Frame3D, str | None]:
-    """Return the similarity of the component, else of the chunk, and its source.
+    """Return the similarity transform of the component, or else of the chunk, and its source.
 
-    Return None if neither has a similarity.
+    Return None if there is no similarity transform.
     """
     places = [(candidate, "component") for candidate in chunk.iterfind("components/component")
               if candidate.get("id", "") == component]  # fmt: skip
@@ -235,7 +237,7 @@ def _similarity(element: Element, file: Path, place: str) -> Frame3D:
 
 
 def _sensors(chunk: Element, file: Path, used: set[str]) -> dict[str, Calibration]:
-    """Return the calibrations of the sensors in use, by sensor id."""
+    """Return the calibrations of the sensors that cameras use, by sensor id."""
     return {
         name: _sensor(sensor, file, f"sensors.sensor[{i}]")
         for i, sensor in enumerate(chunk.iterfind("sensors/sensor"))
@@ -251,7 +253,8 @@ def _sensor(element: Element, file: Path, place: str) -> Calibration:
     if _is_rolling(element):
         what = f"a camera with a rolling shutter ({element.get('label') or 'without a label'})"
         raise refuse_lens(what, fields.where("rolling_shutter"), _GLOBAL)
-    # In the XML file, an adjusted calibration follows the initial calibration.
+    # In the file, an adjusted calibration follows the initial calibration, so take the last
+    # adjusted one.
     calibrations = element.findall("calibration")
     adjusted = [
         calibration for calibration in calibrations if calibration.get("class") == "adjusted"
@@ -304,7 +307,7 @@ def _names(
     sensors: dict[str, Calibration],
     images: Path,
 ) -> tuple[list[str], list[str]]:
-    """Return the photo of each camera, relative to the photo folder, and notes on the pairing."""
+    """Return the photo of each camera relative to the photo folder, and notes on the matching."""
     labels = {
         sensor.get("id", ""): sensor.get("label", "") for sensor in chunk.iterfind("sensors/sensor")
     }

@@ -27,18 +27,18 @@ from crossgrad_plugins.readers._transforms import (
 from crossgrad_plugins.readers.colmap_files.folder import check_scene_folder
 from crossgrad_plugins.readers.place.place import by_gps
 
-#: The lists of training views and held-out views. Of the held-out lists, the first list that
-#: contains views is used.
+#: Fields with the lists of training views and of held-out views. Of the lists of held-out views,
+#: the first list that contains views is used.
 _TRAIN, *_HELD_OUT = "train_filenames", "test_filenames", "val_filenames"
 
 
 class NerfstudioReader(Reader):
-    """nerfstudio's and instant-ngp's `transforms.json`, with any lens that can be undistorted.
+    """`transforms.json` of nerfstudio and instant-ngp, with any lens that can be undistorted.
 
     Format: https://docs.nerf.studio/quickstart/data_conventions.html. `applied_transform` and
-    `applied_scale` are undone, so that cameras and points are in the coordinates that the poses had
-    before these transforms. `train_filenames` and `test_filenames` (else `val_filenames`) give the
-    split, unless there is a train_list.txt or test_list.txt.
+    `applied_scale` are inverted, so that cameras and points get their original coordinates.
+    `train_filenames` and `test_filenames` (or else `val_filenames`) give the split. A file
+    train_list.txt or test_list.txt overrides them.
     """
 
     file: str = Field(_accepts.TRANSFORMS_FILE, description="file of the frames within the scene")
@@ -74,7 +74,7 @@ class NerfstudioReader(Reader):
         return by_gps(build_scene(raw, options), raw)
 
     def _points(self, whole: Fields, base: str) -> tuple[str | None, object]:
-        """Return the requested file of points, and the place in the scene that names the file."""
+        """Return the requested file of points, and the position of its name in the files."""
         if self.points is not None:
             return self.points, "reader.points"
         if "ply_file_path" in whole:
@@ -85,7 +85,7 @@ class NerfstudioReader(Reader):
 
 
 def _applied(whole: Fields) -> Frame3D:
-    """Return the transform from the original world of the poses to the world of the file."""
+    """Return the transform from the original coordinates of the poses to those of the file."""
     scale = whole.positive("applied_scale") if "applied_scale" in whole else 1.0
     if "applied_transform" not in whole:
         return Frame3D(np.eye(3), np.zeros(3), scale)
@@ -99,10 +99,11 @@ def _applied(whole: Fields) -> Frame3D:
 def _split(
     inside: Inside, whole: Fields, base: str, images: str, posed: Sequence[str]
 ) -> tuple[frozenset[str], frozenset[str]] | None:
-    """Return the names of training and held-out views in the photo folder, or None without lists.
+    """Return the names of training and held-out views in the photo folder; None without lists.
 
     Raises:
-        UserError: A list contains no photo of any frame, or a name is in two lists.
+        UserError: A list contains a name that is not the photo of a frame, or a name is in two
+            lists.
     """
     if _TRAIN not in whole:
         return None

@@ -1,9 +1,8 @@
 """Reader of OpenSfM and OpenDroneMap scenes: `reconstruction.json`.
 
 Sources of the format: https://opensfm.org/docs/geometry.html (axes, camera models, pixels),
-https://opensfm.org/docs/dataset.html (reconstruction file format). Normalised coordinates have
-their origin in the middle of the photo. The unit of normalised coordinates is the longer side of
-the photo.
+https://opensfm.org/docs/dataset.html (reconstruction file format). Normalised coordinates are
+measured from the middle of the photo. Their unit is the longer side of the photo.
 """
 
 from collections.abc import Sequence
@@ -34,16 +33,16 @@ from crossgrad_plugins.readers.colmap_files.folder import check_scene_folder
 from crossgrad_plugins.readers.place.place import at, by_gps, origin_of
 
 _BYTE: Final = 255
-#: Smallest divisor for a rotation angle in radians. If the angle is smaller, its sine is equal to
-#: the angle.
+#: Minimum divisor in place of a rotation angle, in radians. For smaller angles, sine and angle are
+#: equal in float64.
 _SMALL: Final = 1e-12
 
 
 class OpenSfmReader(Reader):
-    """OpenSfM's `reconstruction.json`, by itself or in a project of OpenDroneMap.
+    """OpenSfM's `reconstruction.json`, alone or in an OpenDroneMap project.
 
-    If there are several reconstructions, the reconstruction with the most photos is read.
-    Perspective, radial, Brown's and fisheye cameras are undistorted. Scenes with other cameras are
+    If the file contains several reconstructions, the one with the most photos is read. Perspective,
+    radial, Brown's and fisheye cameras are undistorted. Scenes with other camera models are
     refused.
     """
 
@@ -96,7 +95,7 @@ class OpenSfmReader(Reader):
 
 
 def _choose(file: Path) -> tuple[Fields, list[str]]:
-    """Return the reconstruction with the most photos, and a note on other reconstructions."""
+    """Return the reconstruction with the most photos, and a note on the other ones."""
     whole = Fields({"reconstructions": read_json(file)}, file)
     models = whole.items("reconstructions")
     if not models:
@@ -112,9 +111,9 @@ def _choose(file: Path) -> tuple[Fields, list[str]]:
 
 
 def _place(chosen: Fields) -> OnEarth | None:
-    """Return the place on Earth of the reconstruction, or None if there was no GPS.
+    """Return the position on Earth of the reconstruction; None if it has no GPS reference.
 
-    Coordinates of the reconstruction are metres east, north and up from its reference.
+    Coordinates of the reconstruction are metres east, north and up of this reference.
     """
     if "reference_lla" not in chosen:
         return None
@@ -123,7 +122,7 @@ def _place(chosen: Fields) -> OnEarth | None:
         return None
     shots = [shot for shot in chosen.members("shots").values() if "gps_position" in shot]
     off = [_center(shot) - shot.numbers("gps_position", 3) for shot in shots]
-    # Compare only x and y, because OpenSfM does not read altitudes from photos by default.
+    # Compare only x and y, because OpenSfM ignores the altitudes of photos by default.
     level = np.array(off).reshape(-1, 3)[:, :2]
     rms = {"rms_horizontal": float(np.sqrt((level**2).sum(axis=1).mean()))} if off else {}
     return OnEarth(origin, SAME, f"reference_lla of {chosen.file.name}", rms)
@@ -185,7 +184,7 @@ def _center(shot: Fields) -> NDArray[np.float64]:
 
 
 def rotation_by(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rotation [3, 3] about a vector [3] by its length in radians (Rodrigues)."""
+    """Return the rotation [3, 3] about a vector [3] by the vector's length in radians."""
     angle = float(np.linalg.norm(vector))
     x, y, z = vector / max(angle, _SMALL)
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -199,10 +198,10 @@ def _points(chosen: Fields) -> PointCloud:
 
 
 def _column(points: Sequence[Fields], key: str) -> NDArray[np.float64]:
-    """Return one field [P, 3] of all points.
+    """Return [P, 3] a field of all points.
 
-    All points are converted at once, because there may be millions. If a number is wrong, the
-    points are converted one by one, so that the error names the field.
+    All points are converted together for speed, because there may be millions of points. If this
+    fails, the points are converted one by one, so that the error names the wrong field.
     """
     stored = [point.value.get(key) for point in points]
     lists = [value for value in stored if isinstance(value, list) and len(value) == 3]  # noqa: PLR2004

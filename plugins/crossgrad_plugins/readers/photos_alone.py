@@ -1,4 +1,4 @@
-"""Reader of folders that contain only photos: cameras are found as by `crossgrad prepare`."""
+"""Reader of folders of photos without poses, which are estimated as by `crossgrad prepare`."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -11,11 +11,11 @@ from crossgrad_plugins.readers.colmap import ColmapReader
 
 
 class PhotosAloneReader(Reader):
-    """Photos without poses (`--prepare`): their cameras are found, which takes minutes or more.
+    """Photos without poses (`--prepare`); their poses are estimated in minutes or hours.
 
-    The prepared scene is stored in a folder next to the photos. Later calls of `crossgrad prepare`
-    and resumed runs use it again. When the scene is complete, the photos and the scene's folder
-    `prepare/` may be deleted. This reader is never chosen automatically.
+    The prepared scene is stored in a new folder beside the photos. Later calls of `crossgrad
+    prepare` and resumed runs use this scene again. After the scene is complete, the photos and the
+    scene's folder `prepare/` may be deleted. This reader is never chosen automatically.
     """
 
     scene: Path | None = Field(

@@ -1,9 +1,10 @@
 """Reader of RealityCapture (RealityScan) scenes: a CSV of internal and external parameters.
 
 Sources of the format: https://dev.epicgames.com/documentation/realityscan (camera geometry, XMP
-camera math): `f` is in millimetres for a 36 mm sensor. The principal point is measured from the
-middle of the photo, in units of the longer side. Angles are in degrees and follow nerfstudio's
-converter: heading clockwise from north, pitch 0 looks down. Axes: x east, y north, alt up.
+camera math). The column `f` is the focal length in millimetres for a 36 mm sensor. The principal
+point is measured from the middle of the photo in units of the longer side. Angles are in degrees,
+as in nerfstudio's converter: heading is clockwise from north, and pitch 0 looks down. Axes are x
+east, y north and alt up.
 """
 
 from collections.abc import Mapping
@@ -34,14 +35,14 @@ from crossgrad_plugins.readers.colmap_files.folder import check_scene_folder
 from crossgrad_plugins.readers.place.place import by_gps
 
 _LENS: Final = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
-_SENSOR: Final = 36.0  # mm
+_SENSOR: Final = 36.0  # width of a sensor, mm
 _TODO: Final = (
     "export it again: Registration, 'Internal/External camera parameters', as comma-separated text"
 )
 
 
 class RealityCaptureReader(Reader):
-    """RealityCapture's CSV of internal and external camera parameters, with a photo folder.
+    """RealityCapture's CSV of internal and external camera parameters, with a folder of photos.
 
     Points come from a PLY, because the CSV contains no points.
     """
@@ -83,17 +84,18 @@ class RealityCaptureReader(Reader):
 
 @dataclass(frozen=True)
 class _Row:
-    """A row of the file: the photo's name, and the numbers by column."""
+    """A row of the file: the name of a photo, and numbers by column."""
 
     name: str
     fields: Fields
 
 
 def _rows(file: Path) -> list[_Row]:
-    """Return the rows with photos, without empty rows and comments.
+    """Return the rows that name photos, without empty rows and comments.
 
     Raises:
-        UserError: The file cannot be read, a column is missing, or a row has a wrong cell count.
+        UserError: The file cannot be read, a column is missing, or a row has the wrong number of
+            cells.
     """
     columns = Columns.of(file, COLUMNS)
     rows = read_rows(file, "the CSV file of RealityCapture", _TODO, delimiter=columns.delimiter)
@@ -122,11 +124,11 @@ def _rows(file: Path) -> list[_Row]:
 
 
 def _numbers(cells: Mapping[str, str], file: Path, number: int) -> Fields:
-    """Return the cells of a row, with numbers converted.
+    """Return the cells of a row; cells with numbers are converted.
 
-    Cells with other text are refused only when they are used.
+    A cell with other text raises an error only when it is used.
 
-    Numbers may use a comma instead of the decimal point.
+    A comma is accepted as decimal separator.
     """
     values: dict[str, object] = {}
     for name, cell in cells.items():
@@ -176,9 +178,9 @@ def _lens(fields: Fields, photo: Path) -> Calibration:
 
 
 def rotation_of_angles(heading: float, pitch: float, roll: float) -> NDArray[np.float64]:
-    """Return the rotation [3, 3] from camera (x right, y up, z backward) to east, north, up.
+    """Return the rotation [3, 3] from camera axes to east, north and up.
 
-    The angles are in degrees.
+    Camera axes are x right, y up and z backward. The angles are in degrees.
     """
     (sh, ch), (sp, cp), (sr, cr) = (
         (np.sin(angle), np.cos(angle)) for angle in np.deg2rad([-heading, pitch, roll])

@@ -1,4 +1,4 @@
-"""Reader of UC-GS scenes: a COLMAP model with names that mark held-out photos."""
+"""Reader of UC-GS scenes: a COLMAP model whose photo names mark held-out photos."""
 
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -11,16 +11,17 @@ from crossgrad_core.scene.wording import count
 from crossgrad_plugins.readers import _accepts
 from crossgrad_plugins.readers.colmap import ColmapReader, read_raw
 
-#: Prefixes of photo folders.
+#: Prefixes of photo folders for training and held-out photos.
 _TRAIN, _TEST = "train", "test"
 
 
 class UcGsReader(ColmapReader):
     """COLMAP scenes whose photo folders begin with `train` and `test`, as in UC-GS.
 
-    A photo is held out if a folder in its path begins with `test`, or if its name contains the
-    word `eval`. All other photos are used for training. Further folders (`aerial`, `street`) give
-    the regimes. Without such folders, the footprint gives the regimes.
+    A photo is held out if one of its folders begins with `test`, or if its name contains the word
+    `eval`. All other photos are used for training. The names of further folders (`aerial`,
+    `street`) are the regimes. Without such folders, views are divided into regimes by their
+    footprint.
     """
 
     @override
@@ -40,7 +41,7 @@ class UcGsReader(ColmapReader):
 
 
 def _place(name: str) -> str:
-    """Return a name without the folders that separate training from held-out photos."""
+    """Return a name without folders that separate training from held-out photos."""
     *folders, file = PurePosixPath(name).parts
     kept = [folder for folder in folders if not folder.lower().startswith((_TRAIN, _TEST))]
     return "/".join((*kept, file))

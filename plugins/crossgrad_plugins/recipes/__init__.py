@@ -1,1 +1,1 @@
-"""Recipes, which decide settings of a run."""
+"""Recipes: rules that decide the settings of a run."""

@@ -8,53 +8,54 @@ from typing_extensions import override
 from crossgrad_core.plugin import REFERENCE, Decision, Densifier, Facts, Recipe, shortness
 from crossgrad_plugins.recipes import budget
 
-#: Adam's decay rates as published.
+#: Decay rates of Adam's two moments in the published code.
 BETA1, BETA2 = 0.9, 0.999
-#: Components of long runs, and the components that replace them in short runs.
+#: The components of long runs (keys), and the components that replace them in short runs (values).
 DENSIFIER, SHORT_DENSIFIER = "adc", "absgrad"
 RESOLUTION, SHORT_RESOLUTION = "full", "strided"
 INITIALIZER, POINTS_ONLY, EXPOSURE = "fill-gaps", "points", "auto"
-#: A short run with at least this many training photos uses densification by absolute gradients.
-#: With fewer photos, such a run overfits.
+#: A short run uses absolute-gradient densification only if it has at least this many training
+#: photos. With fewer photos, absolute-gradient densification overfits.
 MANY_PHOTOS: Final = 100
 
 #: The published learning rates are for `REFERENCE` steps. A shorter run multiplies them by the
 #: ratio `REFERENCE` / steps to this power. The power is below 1, so a shorter run still has a
 #: smaller sum of learning rates.
 SHORTNESS: Final = 0.45
-#: Largest factor of the learning rates. Runs of about 1,000 steps use it.
+#: Largest factor of the learning rates. It is reached by runs of about 1,000 steps.
 MOST: Final = 4.5
-#: A run has few passes if it renders each training photo fewer times than this, on average. A run
-#: with few passes ends long before it overfits.
+#: A run has few passes if it renders each training photo fewer than 40 times on average. Such a run
+#: ends long before it overfits.
 FEW_PASSES: Final = 40
-#: Power and largest factor of the learning rates for runs with few passes.
+#: Power and largest factor of the learning rates in runs with few passes.
 FEW_PASSES_SHORTNESS, FEW_PASSES_MOST = 0.65, 6.3
-#: In a run with few passes, Adam's second moment averages over this share of the steps, but over at
-#: least `LEAST_MEMORY` steps. The first gradients are much larger than later gradients. The
-#: published average would contain these large gradients for 1,000 steps and slow down training.
+#: In a run with few passes, Adam's second moment averages over this share of the steps, and over at
+#: least `LEAST_MEMORY` steps. The first gradients are much larger than later gradients. With the
+#: published decay rate, these first gradients would slow down training for 1,000 steps.
 MEMORY, LEAST_MEMORY = 1 / 50, 50
-#: Decay of the first moment in short runs. With this value, the first moment averages over 3 steps
-#: instead of 10.
+#: Decay of the first moment in short runs. The first moment then averages over 3 steps instead of
+#: 10.
 SHORT_BETA1: Final = 0.7
-#: Maximum standard deviation of a Gaussian, as a share of a distance. The distance is measured to
-#: the nearest camera whose photo does not contain the Gaussian.
+#: Maximum standard deviation of a Gaussian, as a share of the distance to a camera. The camera is
+#: the nearest one whose photo does not show the Gaussian.
 SCALE_RATIO: Final = 0.5
 #: SH bands above the first are rendered only after this share of a short run with few passes.
-#: Before that, these bands cost time and improve little.
+#: Earlier in the run, these bands cost time and hardly improve the result.
 SH_START: Final = 0.5
 #: Highest SH degree.
 MOST_DEGREES: Final = 3
-#: Constant learning rates decay in this last share of the run.
+#: Learning rates that are otherwise constant decay in this last share of the run.
 LR_TAIL: Final = 0.25
-#: Share of the Gaussians that are left out of a render. It is used if at most `FEW_PHOTOS` photos
-#: see the median point.
+#: Share of the Gaussians that dropout leaves out of a render. Dropout is used if half of the SfM
+#: points are observed by at most `FEW_PHOTOS` photos.
 DROPOUT, FEW_PHOTOS = 0.3, 5
-#: Minimum number of edits of budgeted growth. It applies to runs of at least this many views. In
-#: shorter runs, new Gaussians have no time to converge and can cost 1 dB.
+#: Minimum number of density-control edits of a run with budgeted growth. The minimum applies to
+#: runs of at least `SHORTEST_RUN_WITH_EDITS` views. In shorter runs, new Gaussians have no time to
+#: converge, and late edits can cost 1 dB.
 EDITS, SHORTEST_RUN_WITH_EDITS = 6, 600
-#: Reason that the table shows as long as only the duration of the run is known.
+#: Text in the table of decisions while the length of the run is not yet planned.
 UNKNOWN: Final = "decided when the length is planned"
-#: Documentation page that shows how these values were measured.
+#: Documentation page with the measurements of these values.
 SCHEDULES: Final = "docs/schedules.md"
 
 
@@ -75,7 +76,7 @@ class Auto(Recipe):
 
 
 class Choice:
-    """Values that several decisions need. Each value is computed once.
+    """Values that several decisions use. Each value is computed only once.
 
     Args:
         facts: The facts about the run.
@@ -87,7 +88,7 @@ class Choice:
 
     @cached_property
     def is_plain(self) -> bool:
-        """True if the backbone's Gaussians have their own axes and are rendered as published."""
+        """True if the backbone's Gaussians have separate axes and are rendered as in plain 3DGS."""
         backbone = self.facts.backbone
         return bool(backbone.axes) and backbone.response == "plain"
 
@@ -122,11 +123,12 @@ class Choice:
         return self.facts.densifier(self.densifier_name)
 
     def default_growth(self, *, budgeted: bool) -> Literal["unbounded", "budget"]:
-        """Return the growth mode for any length: set by the user, or else by the densifier."""
+        """Return the growth mode for any length: the user's choice, or the densifier's default."""
         given: Literal["unbounded", "budget"] | None = self.given.get("growth")
         if given is not None:
             return given
-        # If the user sets `max_gaussians`, growth does not use it as a target.
+        # If the user sets `max_gaussians`, the number is only a limit, and growth does not aim at
+        # it.
         named = self.given["max_gaussians"] not in {None, "auto"}
         led = budgeted and self.facts.unit == "views"
         return "budget" if led and not named else "unbounded"
@@ -138,18 +140,18 @@ class Choice:
 
     @cached_property
     def growth(self) -> Literal["unbounded", "budget"]:
-        """The growth mode of this run; at the published length there is no budget."""
+        """The growth mode of this run; a run of the published length has no budget."""
         default = self.default_growth(budgeted=self.densifier.budgeted)
         return default if self.length < REFERENCE or "growth" in self.given else "unbounded"
 
     @cached_property
     def led(self) -> bool:
-        """True if growth follows the schedule of a budget that suits the length."""
+        """True if growth follows the budget for the length of the run."""
         return self.growth == "budget" and self.length < REFERENCE
 
 
 def components(choice: Choice) -> list[Decision]:
-    """Return the decisions about components."""
+    """Return the decisions about the components of the run."""
     facts, name = choice.facts, choice.densifier_name
     default = facts.backbone.default_densifier
     swapped = name != default
@@ -320,7 +322,7 @@ def _rate_factor(choice: Choice) -> float:
 
 
 def _beta1(choice: Choice) -> float:
-    """Return the decay of the first moment: the published value for batch rules and for anchors."""
+    """Return the decay of Adam's first moment; batch rules and anchors use the published value."""
     facts = choice.facts
     if facts.views is None or facts.batched or not facts.backbone.axes:
         return BETA1
@@ -333,14 +335,14 @@ def _beta2(choice: Choice) -> float:
         return BETA2
     memory = max(LEAST_MEMORY, MEMORY * facts.steps)
     if facts.batched:
-        # With K views per step, a run has 1/K as many steps, and Adam averages over 1/K as many
+        # With K views per step, a run has 1/K as many steps, so Adam must average over 1/K as many
         # steps.
         memory *= facts.views / facts.steps
     return min(BETA2, 1.0 - 1.0 / memory)
 
 
 def steps(choice: Choice) -> list[Decision]:
-    """Return the decisions about how a step updates Gaussians."""
+    """Return the decisions about the updates of the parameters in a step."""
     facts, short = choice.facts, choice.facts.short
     along = short and facts.backbone.gaussian_tensors is not None
     bounded = short and facts.backbone.learns_scales
@@ -374,18 +376,21 @@ def steps(choice: Choice) -> list[Decision]:
 
 
 def _sh_start(choice: Choice) -> float:
-    """Return the share of the run before the SH degree grows, rounded to a whole view."""
+    """Return the share of the run before the SH degree grows.
+
+    It corresponds to a whole number of views.
+    """
     facts = choice.facts
     if not choice.few_passes or facts.unit != "views" or facts.published:
         return 0.0
     schedule = facts.schedule(facts.unit)
-    # A custom schedule may be longer than the run.
+    # A learning-rate schedule that the user sets may be longer than the run.
     length = min(schedule.length, schedule.counted(schedule.total))
     return int(SH_START * shortness(schedule.length) * length) / length
 
 
 def ends(choice: Choice) -> list[Decision]:
-    """Return the decisions about the end of a run."""
+    """Return the decisions about the end of a run: learning-rate tail, averaging and floaters."""
     edits = choice.densifier.edits
     fades = any(not block.lr.decays for block in choice.facts.backbone.trained_blocks())
     return [

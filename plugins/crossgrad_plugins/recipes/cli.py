@@ -1,4 +1,4 @@
-"""List the recipes, which decide the settings of a run."""
+"""Commands that list recipes and show their decisions."""
 
 from pathlib import Path
 from typing import Annotated
@@ -36,7 +36,7 @@ def show(
     ] = None,
     steps: Annotated[int, typer.Option(help="Length of the run, in steps.", min=1)] = 30_000,
 ) -> None:
-    """Show what a recipe decides for a scene and a length; nothing is trained."""
+    """Show the settings that a recipe decides for a scene and a length; nothing is trained."""
     announce()
     from crossgrad_core.commands import configured, read_scene, table_of
     from crossgrad_core.plugin import table_lines

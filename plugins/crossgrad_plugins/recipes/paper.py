@@ -1,7 +1,7 @@
-"""Recipes for the paper's experiments, one per arm, as in the grids of benchmarks/grids/paper.
+"""Recipes for the paper's experiments: one for each arm of the grids in benchmarks/grids/paper.
 
-600 views are the 30,000 steps of the paper. Recipe `auto` decides all settings that an arm does not
-set.
+A run of 600 views stands for the paper's run of 30,000 steps. Recipe `auto` decides all settings
+that an arm does not set.
 """
 
 from collections.abc import Mapping
@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Final
 
 from crossgrad_plugins.recipes.auto import Auto
 
-#: Settings that all arms of the experiment share.
+#: Settings that are equal in all arms of the experiment.
 BASE: Final[Mapping[str, Any]] = {
     "max_views": 1200,
     "data.max_size": 400,
@@ -25,7 +25,7 @@ PAIRS: Final[Mapping[str, Any]] = {**BASE, "sampler": "near-far", "views_per_ste
 
 
 class Vanilla30k(Auto):
-    """One view per step, with as many views as the paper's run of 30,000 steps."""
+    """One view per step, as in the paper's baseline of 30,000 steps."""
 
     settings: ClassVar[Mapping[str, Any]] = {
         **BASE,
@@ -36,7 +36,7 @@ class Vanilla30k(Auto):
 
 
 class Vanilla60k(Auto):
-    """One view per step, with as many views in total as an arm with two views per step renders."""
+    """One view per step, but as many rendered views as the arms with two views per step."""
 
     settings: ClassVar[Mapping[str, Any]] = {
         **BASE,
@@ -70,7 +70,7 @@ class NearFar(Auto):
 
 
 class CrossGrad(Auto):
-    """A near and a far view per step, and the symmetric projection of CrossGrad-GS."""
+    """A near and a far view per step, combined by the symmetric projection of CrossGrad-GS."""
 
     settings: ClassVar[Mapping[str, Any]] = {
         **PAIRS,
@@ -80,24 +80,24 @@ class CrossGrad(Auto):
 
 
 class CaGrad(Auto):
-    """A near and a far view per step, and CAGrad."""
+    """A near and a far view per step, combined by CAGrad."""
 
     settings: ClassVar[Mapping[str, Any]] = {**PAIRS, "operator": "cagrad"}
 
 
 class GradNorm(Auto):
-    """A near and a far view per step, and GradNorm."""
+    """A near and a far view per step, combined by GradNorm."""
 
     settings: ClassVar[Mapping[str, Any]] = {**PAIRS, "operator": "gradnorm"}
 
 
 class ConfGate(Auto):
-    """A near and a far view per step, and the gate that uses the confidence of a conflict."""
+    """A near and a far view per step, combined by the gate on a conflict's confidence."""
 
     settings: ClassVar[Mapping[str, Any]] = {**PAIRS, "operator": "confgate"}
 
 
 class Preconditioner(Auto):
-    """A near and a far view per step, and the preconditioner."""
+    """A near and a far view per step, combined by the preconditioner."""
 
     settings: ClassVar[Mapping[str, Any]] = {**PAIRS, "operator": "preconditioner"}

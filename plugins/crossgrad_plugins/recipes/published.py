@@ -29,7 +29,11 @@ VALUES: Final[Mapping[str, Any]] = {
 
 
 class Published(Recipe):
-    """Order of a step, 3-sigma footprint, near plane, learning rates and schedule as published."""
+    """Uses the rules of the published code.
+
+    These are its order of operations in a step, footprint of 3 sigma, near plane, learning rates
+    and schedule.
+    """
 
     settings: ClassVar[Mapping[str, Any]] = {"plan": "off"}
     rasterizer_options: ClassVar[frozenset[str]] = frozenset({"footprint"})

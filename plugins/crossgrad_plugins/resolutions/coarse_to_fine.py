@@ -1,4 +1,4 @@
-"""Base class of the resolutions that begin with small photos and end with the full size."""
+"""Base class of the resolutions that start with reduced photos and end with photos at full size."""
 
 from abc import abstractmethod
 from bisect import bisect_left, bisect_right
@@ -21,23 +21,23 @@ from crossgrad_core.plugin import (
     Schedule,
 )
 
-#: If a scale is at least this value, full size is used instead, because the scale would save hardly
-#: any pixels.
+#: A scale of at least this value is replaced by full size, because it would hardly save any pixels.
 FULL_FROM = 0.95
 _REACHED = "reached"
-#: If density control lasts longer than this share of the run, the window ends at this share.
+#: Largest share of the run after which all views have full size, even if density control lasts
+#: longer.
 LATEST = 0.9
-#: Without density control, the window ends at this share of the run.
+#: Without density control, all views have full size after this share of the run.
 USUAL = 0.5
 
 
 @dataclass(frozen=True)
 class Course:
-    """A sequence of increasing scales, followed by full size.
+    """A sequence of increasing scales for photos, followed by full size.
 
     Attributes:
-        ends: Shares of the window, at most 1, at which the scales end; they never decrease.
-        scales: The scales, in (0, 1), one for each of `ends`; they never decrease.
+        ends: Shares of the window, at most 1, at which each scale ends, in ascending order.
+        scales: One scale in (0, 1) for each entry of `ends`, in ascending order.
     """
 
     ends: tuple[float, ...] = ()
@@ -45,24 +45,28 @@ class Course:
 
     @classmethod
     def of_parts(cls, scales: Sequence[float]) -> "Course":
-        """Return a course whose scales last equally long and together fill the window."""
+        """Return a course that divides the window equally among the scales."""
         count = len(scales)
         return cls(tuple((stage + 1) / count for stage in range(count)), tuple(scales))
 
     @classmethod
     def of_stages(cls, stages: Iterable[tuple[float, float]]) -> "Course":
-        """Return a course of stages (share of the window at which a scale ends, scale)."""
+        """Return a course of stages.
+
+        A stage is the share of the window at which it ends, and its scale.
+        """
         return cls(*map(tuple, zip(*stages, strict=True)))
 
     def at(self, progress: float) -> float:
-        """Return the scale after a share of the window."""
+        """Return the scale that follows a share of the window."""
         stage = bisect_right(self.ends, progress)
         return self.scales[stage] if stage < len(self.scales) else 1.0
 
     def pixels(self, progress: float) -> float:
-        """Return the sum of rendered pixels up to a share of the window, in photos at full size.
+        """Return the sum of rendered pixels up to a share of the window.
 
-        The sum is the integral of the squared scale. The share may be above 1.
+        The unit is the number of pixels of a photo at full size. The sum is the integral of the
+        squared scale. The share may be above 1.
         """
         borders = [min(end, progress) for end in (0.0, *self.ends)]
         parts = zip(pairwise(borders), self.scales, strict=True)
@@ -85,7 +89,7 @@ class Course:
 
 @dataclass(frozen=True)
 class Part:
-    """The course of some photos, and the number of these photos."""
+    """A course, and the number of photos that use it."""
 
     course: Course
     photos: int = 1
@@ -94,8 +98,8 @@ class Part:
 class CoarseToFine(Resolution):
     """Renders and compares small photos first, then larger photos.
 
-    A scale never decreases. This also holds if the clock limits the run and the expected end
-    changes: the state contains the largest scale that each course has reached.
+    A scale never decreases. If the planned end of a run changes, a course could go back to a
+    smaller scale; the state therefore stores the largest scale that each course has reached.
     """
 
     smallest: int = Field(
@@ -104,14 +108,14 @@ class CoarseToFine(Resolution):
 
     @abstractmethod
     def window(self, schedule: Schedule) -> float:
-        """Return the count of views or steps after which views have full size, or 0."""
+        """Return the number of views or steps after which all views have full size, or 0."""
 
     @abstractmethod
     def parts(self) -> Mapping[str, Part]:
-        """Return the courses by regime.
+        """Return the course of each regime.
 
-        A regime that is missing uses the first course. If there is no course, all views have full
-        size.
+        A regime without a course uses the first course. If there are no courses, all views have
+        full size.
         """
 
     @override
@@ -131,7 +135,10 @@ class CoarseToFine(Resolution):
         return tuple(view_scales), PluginState({_REACHED: cast("Json", reached)})
 
     def measured(self, scene: Scene) -> "CoarseToFine":
-        """Return the resolution fitted to the scene; a run calls this before the first step."""
+        """Return the resolution fitted to the scene.
+
+        A run calls this function before the first step.
+        """
         return cast("CoarseToFine", self.fitted_to(scene))
 
     @override
@@ -153,18 +160,18 @@ class CoarseToFine(Resolution):
         return schedule.pace.views(step) * (rendered / every if every else 1.0)
 
     def of_photo(self, camera: Camera, scale: float) -> float:
-        """Return the scale, raised if the photo would otherwise have too few pixels."""
+        """Return the scale, or a larger scale if the photo would otherwise have too few pixels."""
         least = self.smallest / min(camera.width, camera.height)
         return 1.0 if max(scale, least) >= FULL_FROM else max(scale, least)
 
 
 def window_of(schedule: Schedule, until: float | None) -> float:
-    """Return the count of views or steps after which every view has full size.
+    """Return the number of views or steps after which every view has full size.
 
     Args:
         schedule: The schedule of the run.
-        until: A share of the run. None means the end of density control, or half of the run without
-            density control.
+        until: Share of the run after which every view has full size. None means the end of density
+            control, or half of the run if there is no density control.
     """
     whole = schedule.counted(schedule.total)
     if until is not None:

@@ -1,4 +1,4 @@
-"""A quarter of the photos' size, then half, then full size."""
+"""Photos at 1/4 of their size, then at 1/2, then at full size."""
 
 from collections.abc import Mapping
 from typing import Self
@@ -11,7 +11,7 @@ from crossgrad_plugins.resolutions.coarse_to_fine import CoarseToFine, Course, P
 
 
 class Octaves(CoarseToFine):
-    """Photos at 1/4 of their size first, then at 1/2, then at full size for the rest of the run.
+    """Renders photos at 1/4 of their size first, then at 1/2, then at full size.
 
     This schedule was developed for crossgrad.
     """

@@ -1,4 +1,4 @@
-"""Scales that follow the spectrum of the photos (DashGaussian)."""
+"""Scales that follow the amplitude spectrum of the photos (DashGaussian)."""
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -15,29 +15,29 @@ from typing_extensions import override
 from crossgrad_core.plugin import Field, Scene, Schedule, View
 from crossgrad_plugins.resolutions.coarse_to_fine import CoarseToFine, Course, Part, window_of
 
-#: Maximum number of photos whose spectrum is measured, over all regimes together.
+#: Maximum number of photos whose spectrum is measured, in all regimes together.
 MOST_PHOTOS = 32
-#: Regimes get separate scale courses if their shares of the spectrum that a scale keeps differ by
-#: more than this.
+#: Two regimes get separate courses of scales if their kept shares of the spectrum differ by more
+#: than this value.
 ALIKE = 0.05
 #: Name of the scale course that applies to all photos.
 ALL = "all"
-#: Number of scales, from 1 / GRID to 1, at which the kept shares of the spectrum are measured.
+#: Number of scales, from 1 / GRID to 1, for which the kept share of the spectrum is measured.
 GRID = 256
-#: Largest side in pixels of the window in the middle of a photo that is analysed. In a cropped
-#: photo, a scale keeps the same share of the spectrum as in the whole photo. In a smaller copy of
-#: the photo, the scale keeps another share.
+#: Only a window in the middle of a photo is analysed; this is its largest side, in pixels. The
+#: photo is cropped and not reduced, because the crop keeps the relation between a scale and the
+#: share of the spectrum.
 _WINDOW = 1024
-#: Number of photos that are decoded at once. More photos would need too much memory.
+#: Number of photos that are decoded at the same time. More photos would need too much memory.
 _AT_ONCE = 2
-#: Tolerance for a frequency that a scale just keeps, because the frequency may have been rounded
-#: up.
+#: Tolerance for the comparison of a frequency with the limit of a scale, because frequencies are
+#: rounded.
 _ROUNDING = 1e-9
 Floats = NDArray[np.float64]
 
 
 class Scales(BaseModel):
-    """The scales of some photos, as written to config.yaml."""
+    """The course of scales for a group of photos, as written to config.yaml."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -48,12 +48,12 @@ class Scales(BaseModel):
 
 
 class Spectral(CoarseToFine):
-    """Keeps photos small as long as the small size contains most of their spectrum.
+    """Renders reduced photos as long as the reduced size contains most of the photos' spectrum.
 
-    X(F_r) is the sum of the amplitudes of the frequencies that photos at 1 / r of the size contain.
-    A run begins with the r at which X(F_r) = X(F) / ratio. The run changes from an r to the next
-    finer r after the share X(F_r) / X(F) of the window. Between the levels of r, the number of
-    pixels grows linearly.
+    Let F be all frequencies and F_r the frequencies that a photo at 1 / r of its size contains. X
+    is the sum of the amplitudes of a set of frequencies. A run starts with the reduction r at which
+    X(F_r) = X(F) / ratio. The run changes from r to the next smaller r after the share X(F_r) /
+    X(F) of the window. Between two values of r, the number of pixels grows linearly.
 
     Source: DashGaussian (arXiv 2503.18402).
     """
@@ -102,7 +102,7 @@ class Spectral(CoarseToFine):
         }
 
     def _groups(self, scene: Scene) -> Mapping[str, "_Group"]:
-        """Return the groups of photos that share a course, by name."""
+        """Return groups of photos by name; the photos of a group have one course of scales."""
         views = scene.train_views
         regimes = sorted({view.regime for view in views}) if self.per_regime != "never" else []
         if len(regimes) > 1:
@@ -117,7 +117,10 @@ class Spectral(CoarseToFine):
         return {ALL: _Group.of(views, MOST_PHOTOS)}
 
     def _scales(self, group: "_Group") -> tuple[float, ...]:
-        """Return the scales in equal parts of the window; empty if full size is needed at once."""
+        """Return the scales for equal parts of the window.
+
+        The result is empty if full size is needed at once.
+        """
         scales = np.arange(GRID + 1) / GRID
         least = min(1.0, max(1.0 / self.coarsest, self.smallest / group.shorter))
         first = int(np.argmax((scales >= least) & (group.kept >= 1.0 / self.ratio)))
@@ -126,10 +129,10 @@ class Spectral(CoarseToFine):
         levels = np.unique(np.linspace(first, GRID, self.levels + 1).round().astype(int))
         ends, pixels = group.kept[levels], scales[levels] ** 2
         parts = np.arange(self.levels) / self.levels
-        # `ahead` is the level that the run leaves next.
+        # `ahead` is the next level that the run has to reach.
         ahead = np.searchsorted(ends, parts, side="right")
         behind = np.maximum(ahead - 1, 0)
-        # Before the first level is left, there is no level to interpolate from.
+        # Before the first level, there is no earlier level for the interpolation.
         share = (parts - ends[behind]) / np.where(ahead > 0, ends[ahead] - ends[behind], np.inf)
         areas = pixels[behind] + share * (pixels[ahead] - pixels[behind])
         return tuple(np.sqrt(areas).round(4).tolist())
@@ -137,12 +140,12 @@ class Spectral(CoarseToFine):
 
 @dataclass(frozen=True, eq=False)
 class _Group:
-    """A group of photos that share a course.
+    """A group of photos that have one course of scales.
 
     Attributes:
-        views: The views of the photos.
-        kept: [GRID + 1] share of the spectrum that the scales 0, 1 / GRID .. 1 keep.
-        shorter: Median of the shorter side, in pixels.
+        views: The views of the group.
+        kept: [GRID + 1] share of the spectrum that each of the scales 0, 1 / GRID .. 1 keeps.
+        shorter: Median of the photos' shorter side, in pixels.
     """
 
     views: Sequence[View]
@@ -151,7 +154,10 @@ class _Group:
 
     @classmethod
     def of(cls, views: Sequence[View], most: int) -> "_Group":
-        """Return the group of `views`; at most `most` spectra, evenly spread, are measured."""
+        """Return the group of `views`.
+
+        The spectrum is measured for at most `most` views, at even intervals.
+        """
         chosen = np.linspace(0, len(views) - 1, min(most, len(views))).round().astype(int)
         shorter = [min(view.camera.width, view.camera.height) for view in views]
         kept = kept_shares([views[index] for index in chosen])
@@ -164,16 +170,17 @@ def _course(scales: tuple[float, ...]) -> Course:
 
 
 def kept_shares(views: Sequence[View]) -> Floats:
-    """Return [GRID + 1] X(F_r) / X(F) at scales 0, 1 / GRID .. 1: the share of the spectrum kept.
+    """Return [GRID + 1] the share of the spectrum that each scale keeps.
 
-    X(F) is the sum of the amplitudes |DFT| of the grey photos. X(F_r) is the sum over the
-    frequencies that a photo at 1 / r of the size contains: at most 1 / r of the highest frequency,
-    in x and in y. Each photo is processed by one thread, and sums are in the order of the photos,
-    so the result does not depend on the number of threads. For photos whose amplitudes are all
-    zero, the share is 1 at every scale.
+    The scales are 0, 1 / GRID .. 1, and the share at scale 1 / r is X(F_r) / X(F). X(F) is the sum
+    of the amplitudes |DFT| over all frequencies of the grey photos. X(F_r) is the sum over the
+    frequencies up to 1 / r of the highest frequency, in x and in y. A photo at 1 / r of the size
+    contains these frequencies. Each photo is processed by one thread, and the sums follow the order
+    of the photos. The result therefore does not depend on the number of threads. If all amplitudes
+    of the photos are zero, the share is 1 at every scale.
 
     Args:
-        views: The views, at least one.
+        views: The views; at least one is needed.
 
     Raises:
         UserError: A photo cannot be decoded.
@@ -191,7 +198,7 @@ def _of_view(view: View) -> Floats:
 
 
 def grey_window(image: Tensor, mask: Tensor | None) -> Floats:
-    """Return [h, w] the middle of a photo in grey, 0 to 255; masked pixels get the mean.
+    """Return [h, w] the middle of a photo in grey, 0 to 255; masked pixels get the mean grey value.
 
     Args:
         image: [H, W, 3] uint8.
@@ -207,21 +214,24 @@ def grey_window(image: Tensor, mask: Tensor | None) -> Floats:
 
 
 def amplitudes_within(grey: Floats) -> Floats:
-    """Return [GRID + 1] the sum of the amplitudes |DFT| of the frequencies that each scale keeps.
+    """Return [GRID + 1] the sums of the amplitudes |DFT| of the frequencies that each scale keeps.
 
     Args:
-        grey: [H, W] photo.
+        grey: [H, W] grey photo.
     """
     height, width = grey.shape
     amplitudes = np.abs(np.fft.rfft2(grey))
-    # For a real image, the other half of the spectrum has equal amplitudes, so double these
-    # columns. Exceptions are the first column and, if the number of columns is even, the last
-    # column.
+    # The transform of a real image stores only half of the columns; the other half has equal
+    # amplitudes. Count each column twice. Count the first column once, and also the last column if
+    # the number of columns is even.
     amplitudes[:, 1 : (width + 1) // 2] *= 2.0
     cells = np.maximum.outer(_cells(np.fft.fftfreq(height)), _cells(np.fft.rfftfreq(width)))
     return np.cumsum(np.bincount(cells.ravel(), amplitudes.ravel(), GRID + 1))
 
 
 def _cells(frequencies: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Return the first scale index that keeps each frequency, cycles per pixel in [-1/2, 1/2]."""
+    """Return the index of the first scale that keeps each frequency.
+
+    Frequencies are in cycles per pixel, [-1/2, 1/2].
+    """
     return np.asarray(np.ceil(2.0 * GRID * np.abs(frequencies) - _ROUNDING), dtype=np.int64)

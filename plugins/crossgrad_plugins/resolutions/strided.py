@@ -1,4 +1,4 @@
-"""Some pixels of each photo for most of the run, all pixels at its end."""
+"""Renders of some pixels of each photo for most of the run, and of all pixels at its end."""
 
 from collections.abc import Mapping
 from math import ceil, isqrt
@@ -10,19 +10,21 @@ from typing_extensions import override
 from crossgrad_core.plugin import Camera, Field, Scene, Schedule, listed, shortness
 from crossgrad_plugins.resolutions.coarse_to_fine import CoarseToFine, Course, Part
 
-#: Share of a short run in which only a part of the pixels is rendered, at most one pixel of each 2
-#: x 2. In longer runs, the share is smaller.
+#: Share of a short run in which only some of the pixels are rendered. The share is smaller in
+#: longer runs.
 _SHARE = 0.8
-#: Shares of this window. Until the first share, one pixel of each 8 x 8 is rendered. Until the
-#: second share, one pixel of each 4 x 4 is rendered.
+#: Shares of this window at which the first two stages end. The first stage renders one pixel of
+#: each 8 x 8 block. The second stage renders one pixel of each 4 x 4 block, and the rest of the
+#: window one pixel of each 2 x 2 block.
 _EIGHTH, _QUARTER = 0.3, 0.6
 
 
 class Strided(CoarseToFine):
-    """Renders one pixel of each n x n block up to a share of the run, a new pixel in each step.
+    """Renders one pixel of each n x n block up to a share of the run.
 
-    Photos are not reduced. The rendered pixels have the same values as in the full render. So the
-    gradients of a per-pixel error are unbiased. This schedule was developed for crossgrad.
+    The position of the pixel in the block is new in each step. The photos are not reduced in size.
+    The rendered pixels have the same values as in a render of all pixels. The gradients of a
+    per-pixel error are therefore unbiased. This schedule was developed for crossgrad.
     """
 
     strided: ClassVar[bool] = True
@@ -44,7 +46,7 @@ class Strided(CoarseToFine):
     @override
     def fitted_to(self, scene: Scene) -> "Strided":
         most = [self._most(view.camera) for view in scene.train_views]
-        # If the user sets n, it is used for all photos that are large enough for it.
+        # If the user sets n, it is used for all photos that are large enough.
         n = median(most) if self.coarsest is None else min(self.coarsest, max(most))
         return self.model_copy(
             update={"coarsest": max(stride for stride in (1, 2, 4, 8) if stride <= n)}
@@ -52,8 +54,8 @@ class Strided(CoarseToFine):
 
     @override
     def measured(self, scene: Scene) -> CoarseToFine:
-        # Use the stored value. This function is called in each step, and examining all photos again
-        # would take too long.
+        # Use the stored value, because this function is called in each step. Examining all photos
+        # again would take too long.
         return self if self.coarsest is not None else self.fitted_to(scene)
 
     @override
@@ -98,6 +100,6 @@ class Strided(CoarseToFine):
         return 1.0 / min(round(1.0 / scale), self._most(camera))
 
     def _most(self, camera: Camera) -> int:
-        """Return the largest n that a photo allows."""
+        """Return the largest n that the size of a photo allows."""
         by_side = min(camera.width, camera.height) // self.smallest
         return max(1, min(by_side, isqrt(camera.width * camera.height // self.least)))

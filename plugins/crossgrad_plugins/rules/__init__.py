@@ -1,1 +1,1 @@
-"""Built-in rules: actions during training that are not part of the basic loop."""
+"""Built-in rules: actions during training that the training loop itself does not contain."""

@@ -1,8 +1,8 @@
 """Removal of floaters at the end of a run: primitives near a camera that no training photo shows.
 
-A step may move a Gaussian behind its camera or out of the photo at the side. Then no photo gives a
-gradient for the Gaussian, so the Gaussian does not change any more. If the Gaussian is opaque, it
-hides the scene in photos from nearby (docs/floaters.md). The rule was developed for crossgrad.
+A step can move a Gaussian behind the camera of a photo, or out of the photo. Then no photo gives
+the Gaussian a gradient, so the Gaussian stays as it is. An opaque Gaussian of this kind hides the
+scene in photos that are taken near it (docs/floaters.md). This rule was developed for crossgrad.
 """
 
 from typing import Final
@@ -26,29 +26,30 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: The nearest depth of a camera is this percentile of the depths of its SfM points. The minimum is
-#: not used, because single points are often wrong.
+#: This percentile of the depths of a camera's SfM points counts as its nearest depth. The minimum
+#: is not used, because single points are often wrong.
 NEAREST: Final = 1.0
-#: A camera that observes fewer points than this gives no reliable information about empty space.
+#: A camera that observes fewer points than this is not used, because its nearest depth is
+#: unreliable.
 FEWEST_SEEN: Final = 8
 
 
 class Floaters(Rule):
-    """Removes primitives around cameras that no training photo shows, when a run is finished."""
+    """At the end of a run, removes primitives near cameras that no training photo shows."""
 
     empty: float = Field(
         0.3,
         gt=0,
         le=1,
-        # The nearest observed point of a level camera is farther away than the ground below it,
-        # because the camera sees the ground only at a distance.
+        # The empty space must end far before the nearest observed point, because the ground below a
+        # level camera is nearer than every point that the camera observes.
         description="depth range that counts as empty, as a share of the distance from a camera "
         "to the nearest point that it observes",
     )
 
     @hookimpl
     def crossgrad_final_edit(self, model: Model) -> FinalEdit | None:
-        """Remove the floaters, unless this would remove all primitives."""
+        """Remove the floaters, unless all primitives would be removed."""
         count, rows = _primitives(model), floaters(model, self.empty)
         if not 0 < len(rows) < count:
             return None
@@ -66,7 +67,7 @@ class Floaters(Rule):
 
 
 def removed(count: int) -> str:
-    """Return the log line about the removal of `count` primitives."""
+    """Return the line of the log about the removal of `count` primitives."""
     were = "primitive was" if count == 1 else "primitives were"
     return (
         f"floaters: {count:,} {were} removed from the empty space around training cameras, "
@@ -79,14 +80,15 @@ def _primitives(model: Model) -> int:
 
 
 def floaters(model: Model, empty: float) -> Tensor:
-    """Return [F] int64 rows of primitives in empty space that touch no training photo.
+    """Return [F] int64 indices of primitives in empty space that no training photo shows.
 
-    A primitive that is hidden by other primitives counts as touched. A primitive is therefore a
-    floater only if the rasterizer omits it from every training photo.
+    A primitive that other primitives hide counts as shown. A primitive is a floater only if the
+    rasterizer culls it in every training photo.
 
     Args:
         model: The model at the end of the run.
-        empty: Share of the distance from a camera to the nearest point that the camera sees.
+        empty: Radius of the empty space around a camera, as a share of the distance to the nearest
+            point that the camera sees.
     """
     parameters, backbone = model.parameters, model.backbone
     if backbone.positions not in parameters:
@@ -97,8 +99,8 @@ def floaters(model: Model, empty: float) -> Tensor:
     for view in model.scene.train_views:
         if len(rows) == 0:
             break
-        # Render only the candidates, because this takes little time. Other Gaussians that hide the
-        # candidates do not matter.
+        # Render only the candidates, because a render of all Gaussians takes longer. The omitted
+        # Gaussians do not matter, because hidden candidates count as shown.
         alone = apply_to_parameters(Edit(rows), backbone.blocks(), parameters)
         with torch.no_grad():
             gaussians = backbone.decode(alone, view.camera, model.phase)
@@ -111,19 +113,21 @@ def floaters(model: Model, empty: float) -> Tensor:
 
 
 def cameras_that_tell(scene: Scene) -> list[View]:
-    """Return the training views that observe enough points to bound the empty space."""
+    """Return the training views that observe enough points for an estimate of the empty space."""
     return [view for view in scene.train_views if len(view.seen) >= FEWEST_SEEN]
 
 
 def in_empty_space(positions: NDArray[np.float64], scene: Scene, empty: float) -> NDArray[np.bool_]:
-    """Return [N] bool: True if a position is in the empty space around the nearest camera.
+    """Return [N], True if a position is in the empty space around the nearest camera.
 
     Args:
         positions: [N, 3], local frame.
-        scene: The scene; its training cameras and the SfM points that they see are used.
-        empty: Share of the distance from a camera to the nearest point that the camera sees.
+        scene: The scene, whose training cameras and observed SfM points bound the empty space.
+        empty: Radius of the empty space around a camera, as a share of the distance to the nearest
+            point that the camera sees.
     """
-    from scipy.spatial import cKDTree  # Import it here, because the import is slow.
+    # Import the k-d tree here, because SciPy's module loads slowly.
+    from scipy.spatial import cKDTree
 
     views = cameras_that_tell(scene)
     if not views:

@@ -1,7 +1,8 @@
 """A decay of learning rates at the end of a run.
 
-The published learning rates of opacity, scale and colour are constant, so renders still fluctuate
-at the end of a run. A decay of the learning rates removes these fluctuations (docs/steady-ends.md).
+The published learning rates of opacity, scale and colour are constant, so the parameters still
+fluctuate at the end of a run. A decay of these learning rates removes the fluctuations
+(docs/steady-ends.md).
 """
 
 from typing_extensions import override
@@ -10,7 +11,7 @@ from crossgrad_core.plugin import Backbone, Field, LearningRate, Rule, Scene, Sc
 
 
 class LrTail(Rule):
-    """Decays constant learning rates over the last share of the steps."""
+    """Decays the constant learning rates over the last share of the steps."""
 
     share: float = Field(
         0.25,
@@ -26,9 +27,9 @@ class LrTail(Rule):
     def crossgrad_rate_factor(
         self, rate: LearningRate, step: int, schedule: Schedule
     ) -> float | None:
-        """Decay learning rates log-linearly from 1 to `factor`.
+        """Return the factor of a learning rate, which decays log-linearly from 1 to `factor`.
 
-        Return None for learning rates that decay already.
+        Return None for learning rates that already decay.
         """
         total = schedule.total
         step, start = min(step, total), (1.0 - self.share) * total

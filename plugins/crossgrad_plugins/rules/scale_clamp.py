@@ -1,9 +1,10 @@
 """A bound on the sizes of Gaussians near cameras.
 
-A rasterizer projects a Gaussian as if the Gaussian were small compared with its distance. A large
-Gaussian beside or behind a camera therefore spreads over the camera's view, and a training photo
-may not show it (docs/floaters.md). If the camera's own photo shows the Gaussian, training corrects
-the size without this rule. The rule was developed for crossgrad.
+A rasterizer projects a Gaussian with an approximation that holds only if the Gaussian is small
+compared with its distance. A large Gaussian beside or behind a camera can therefore cover the
+camera's whole view, although no training photo shows it (docs/floaters.md). If the camera's own
+photo shows the Gaussian, training corrects the size without this rule. This rule was developed for
+crossgrad.
 """
 
 from math import log
@@ -30,15 +31,15 @@ from crossgrad_core.plugin import (
 
 #: Number of steps between two checks of the sizes.
 EVERY: Final = 50
-#: Gaussians with a smaller size, in scene extents, are not checked. Most Gaussians are smaller, and
-#: hardly any of them exceeds the bound.
+#: Gaussians below this size, in units of the scene extent, are not checked. Most Gaussians are
+#: smaller, and hardly any of them exceeds the bound.
 LEAST: Final = 0.01
-#: Maximum number of distances that are computed at once.
+#: Maximum number of distances that are computed at the same time, to limit memory.
 _AT_ONCE: Final = 2**20
 
 
 class ScaleClamp(Rule):
-    """Limits standard deviations of Gaussians by the distance to cameras that do not show them."""
+    """Limits the sizes of Gaussians by their distance to cameras that do not show them."""
 
     ratio: float = Field(
         0.5,
@@ -49,7 +50,7 @@ class ScaleClamp(Rule):
 
     @hookimpl
     def crossgrad_after_optimizer(self, context: AfterStepContext) -> DensifyResult | None:
-        """Shorten axes that are too long, in each step in which sizes are checked."""
+        """Shorten axes that are too long, in the steps in which sizes are checked."""
         names, scene, ratio = context.backbone.gaussian_tensors, context.scene, self.ratio
         if context.step % EVERY or names is None:
             return None
@@ -59,7 +60,7 @@ class ScaleClamp(Rule):
         rows = rows[_may_be_near(scene, positions[rows], torch.exp(largest[rows]) / ratio)]
         distances = _nearest_beside(scene, positions[rows].double().cpu().numpy())
         most = torch.from_numpy(np.log(np.maximum(ratio * distances, LEAST))).to(scales)
-        # Leave out values that are not finite, because the finiteness check reports them.
+        # Skip non-finite values, because the finiteness check reports them.
         above = (largest[rows] > most) & largest[rows].isfinite()
         rows, most = rows[above], most[above]
         if not len(rows):
@@ -74,11 +75,11 @@ class ScaleClamp(Rule):
 
 
 def _may_be_near(scene: Scene, positions: Tensor, distances: Tensor) -> Tensor:
-    """Return [N] bool: True for all positions [N, 3] nearer than `distances` [N] to any camera.
+    """Return [N], True for each position [N, 3] that is nearer than `distances` [N] to a camera.
 
-    A few positions that are farther away may be True as well. The squared distance is computed as a
-    product, which is fastest. The product loses precision for large coordinates, so an error bound
-    is subtracted.
+    A few positions that are slightly farther away may also be True. Squared distances are computed
+    from products of coordinates, because this form is fastest. This form loses precision for large
+    coordinates, so an error bound is subtracted.
     """
     centers = torch.from_numpy(scene.centers).to(positions)
     squares, of_centers = (points.square().sum(dim=1) for points in (positions, centers))
@@ -91,9 +92,9 @@ def _may_be_near(scene: Scene, positions: Tensor, distances: Tensor) -> Tensor:
 
 
 def _nearest_beside(scene: Scene, positions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return [N] the distance of each position [N, 3] to a camera.
+    """Return [N] the distance of each position [N, 3] to the nearest camera that does not show it.
 
-    The camera is the nearest training camera whose photo does not show the position.
+    Only training cameras are considered.
 
     The distance is infinite for positions that all photos show.
     """

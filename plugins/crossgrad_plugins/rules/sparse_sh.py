@@ -1,4 +1,4 @@
-"""Updates of SH bands in only some of the steps, which saves time (docs/schedules.md)."""
+"""Updates of SH bands in only some of the steps, to save time (docs/schedules.md)."""
 
 from collections.abc import Mapping
 
@@ -16,7 +16,7 @@ class SparseSh(Rule):
 
     @hookimpl
     def crossgrad_update_intervals(self, blocks: tuple[Block, ...]) -> Mapping[str, int]:
-        """Return the interval for all tensors that need not be updated in every step."""
+        """Return the update interval of every tensor that is not updated in each step."""
         return {name: self.every for block in blocks if block.rests for name in block.tensors}
 
     @override

@@ -1,4 +1,4 @@
-"""The average of the last parameters, used for evaluation and export (docs/steady-ends.md)."""
+"""The mean of the last parameters, used for evaluation and export (docs/steady-ends.md)."""
 
 from collections.abc import Iterable, Mapping
 from typing import ClassVar, Final
@@ -16,13 +16,14 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: The name of the rule and of its state.
+#: Name of the rule and of its stored state.
 NAME: Final = "weight-averaging"
 _COUNT: Final = "count"
-#: Maximum number of states in an average. Neighbouring states hardly differ, and a sum of 100
-#: float32 numbers has a rounding error of about one millionth.
+#: Maximum number of steps whose parameters are averaged. Parameters of neighbouring steps hardly
+#: differ. The sum of 100 float32 numbers has a relative rounding error of about one millionth.
 SAMPLES: Final = 100
-#: Number of decimals of a step number that are kept. Further decimals are rounding errors.
+#: Number of decimals to which a step number is rounded. Further decimals contain only rounding
+#: errors.
 _DIGITS: Final = 6
 
 
@@ -39,15 +40,16 @@ class WeightAveraging(Rule):
 
     @hookimpl
     def crossgrad_step_done(self, context: AfterStepContext) -> Answer | None:
-        """Add the parameters to the sums in the steps that are averaged.
+        """Add the parameters to the sums if this step is one of the averaged steps.
 
-        The sums start again if the set of primitives changed or if values were overwritten.
+        The sums start again if the number or order of primitives changed, or if parameters were
+        overwritten.
         """
         held, total = context.state(NAME), context.schedule.total
-        # Round before the conversion. A tenth of ten steps is one step, but binary floating point
-        # gives another value.
+        # Round before the conversion. A tenth of ten steps is one step, but floating-point
+        # arithmetic gives a slightly different value.
         before = int(round((1.0 - self.share) * total, _DIGITS))
-        # If the run was extended, this drops the earlier average.
+        # If the run was extended, drop the average that was computed before the extension.
         left_out = context.step <= before
         state = EMPTY_STATE if context.edited or left_out else held
         if not left_out and (total - context.step) % -(-(total - before) // SAMPLES) == 0:
@@ -58,7 +60,7 @@ class WeightAveraging(Rule):
     def crossgrad_eval_parameters(
         self, states: Mapping[str, PluginState]
     ) -> Mapping[str, Tensor] | None:
-        """Return the mean parameters, or None if no step has been averaged yet."""
+        """Return the mean parameters, or None if no step has been averaged."""
         held = states.get(NAME, EMPTY_STATE)
         count = held.values.get(_COUNT)
         if not isinstance(count, int):
@@ -70,9 +72,10 @@ class WeightAveraging(Rule):
 def _added(
     state: PluginState, blocks: Iterable[Block], parameters: Mapping[str, Tensor]
 ) -> PluginState:
-    """Return the state with the parameters added to its sums.
+    """Return the state after the parameters were added to its sums.
 
-    Sums have the same bits for any number of threads. The sums are divided when the means are used.
+    The sums are bitwise equal for any number of threads. The division by the number of steps
+    happens when the means are used.
     """
     previous = {**state.tensors, **state.per_primitive}
     sums: tuple[dict[str, Tensor], dict[str, Tensor]] = ({}, {})

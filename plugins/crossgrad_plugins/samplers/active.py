@@ -1,4 +1,4 @@
-"""Active pairs: a view, and a partner from the other group with a very different loss."""
+"""Active pairs: a view, and a partner from the other group whose loss is very different."""
 
 from collections.abc import Mapping, Sequence
 from math import isfinite
@@ -24,13 +24,13 @@ _SMALLEST_TEMPERATURE = 1e-8
 
 
 class Active(Sampler):
-    """A uniform view, and a view of the other group chosen by the difference in running loss.
+    """Draws a uniform view, and a partner of the other group by the difference of their losses.
 
-    The partner is drawn from the `top` views of the other group with the largest |loss - loss of
-    the first view|. The draw is a softmax whose temperature is the standard deviation of these
-    differences. Losses are running means per view. A running mean starts again when the octave of
-    the view's scale changes. Views that were never rendered have no running loss; they are drawn
-    first, as first view or as partner.
+    The partner is one of the `top` views of the other group with the largest |loss - loss of the
+    first view|. It is drawn with softmax probabilities; their temperature is the standard deviation
+    of these loss differences. Every view has a running mean of its losses. This mean starts again
+    when the view's resolution changes to another octave. Views that were never rendered have no
+    running mean and are drawn first, as first view or as partner.
 
     Source: the paper, active loss-disparity pairing. The values of top, temperature and decay were
     chosen for crossgrad, because the paper does not give them.
@@ -62,10 +62,11 @@ class Active(Sampler):
     def _running_losses(
         self, last: StepRecord | None, state: PluginState
     ) -> tuple[dict[str, float], dict[str, int]]:
-        """Return the running loss and the octave of each view (its index as text, for JSON).
+        """Return the running mean of the loss and the octave of each view.
 
-        The losses include the last completed step. A view's running loss starts again when the view
-        is rendered at another octave of scale. Views at full size have no entry in the octaves.
+        Keys are view indices as text, for JSON. The means include the last completed step. The mean
+        of a view starts again when the view is rendered at another octave of resolution. Views at
+        full size have no octave entry.
         """
         losses = dict(cast("Mapping[str, float]", state.values.get("losses", {})))
         octaves = dict(cast("Mapping[str, int]", state.values.get("octaves", {})))
@@ -89,16 +90,16 @@ class Active(Sampler):
         losses: Mapping[str, float],
         rng: np.random.Generator,
     ) -> int:
-        """Return the second view.
+        """Return the partner of the first view.
 
-        A view that was never rendered is preferred. Without such a view, the loss difference
-        decides.
+        A view of the other group that was never rendered is preferred. Without such a view, the
+        partner is drawn by the difference of losses.
         """
         fresh = _never_rendered(others, losses)
         if fresh or str(first) not in losses:
             return _uniform(fresh or others, rng)
         scores = np.abs(np.array([losses[str(view)] for view in others]) - losses[str(first)])
-        # Use a stable sort, so that views with equal scores keep their order.
+        # Use a stable sort, so that views with equal differences keep their order.
         best = np.argsort(-scores, kind="stable")[: self.top]
         temperature = max(float(scores[best].std()), _SMALLEST_TEMPERATURE)
         logits = (scores[best] - scores[best].max()) / temperature
@@ -107,7 +108,7 @@ class Active(Sampler):
 
 
 def _never_rendered(pool: Sequence[int], losses: Mapping[str, float]) -> list[int]:
-    """Return the views of the pool without a running loss."""
+    """Return the views of the pool that have no running mean of the loss."""
     return [view for view in pool if str(view) not in losses]
 
 

@@ -1,4 +1,4 @@
-"""Anchor pairs: near cameras are paired with far cameras, middle cameras with middle cameras."""
+"""Anchor pairs: a near and a far camera, or two middle cameras."""
 
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
@@ -21,12 +21,13 @@ _OPPOSITE = {"near": "far", "far": "near"}
 
 
 class Anchors30(Sampler):
-    """A uniform view, and a partner from the opposite anchor group (middle views: from the middle).
+    """Draws a uniform view, and a partner from the opposite anchor group.
 
-    Intended for operator `anchors`, which projects only between the views of an anchor pair.
+    The partner of a middle view is a middle view. The sampler is intended for operator `anchors`,
+    which projects gradients only between the near and the far view of a pair.
 
-    Source: the paper, operator variants (the nearest and farthest 30 % are anchors; the sampling
-    rule was developed for crossgrad).
+    Source: the paper, operator variants, which defines the anchors as the nearest and farthest 30
+    %; the sampling rule was developed for crossgrad.
     """
 
     views: ClassVar[ViewCounts] = ViewCounts(2, 2)
@@ -35,7 +36,7 @@ class Anchors30(Sampler):
 
     @hookimpl
     def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
-        """Return an objection if the grouping has no near or no far group."""
+        """Return an objection if the grouping has no near group or no far group."""
         if selection.labels is not None and not {"near", "far"} <= set(selection.labels):
             return [
                 (

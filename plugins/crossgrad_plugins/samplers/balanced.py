@@ -22,13 +22,13 @@ HALVES = ("first", "second")
 
 
 class NearFar(Sampler):
-    """K/2 near and K/2 far views per step; near and far views alternate within the step.
+    """Draws K/2 near and K/2 far views per step, alternately.
 
-    With `alternating`, a step has one view: near in odd steps, far in even steps. If the grouping
-    has two other labels, they alternate in alphabetical order.
+    With `alternating`, a step has one view: a near view in odd steps, a far view in even steps. If
+    the labels of the grouping are not near and far, its two groups alternate in alphabetical order.
 
-    Source: the paper, altitude-balanced view pairing (one uniform near view and one uniform far
-    view, independent).
+    Source: the paper, altitude-balanced view pairing: one uniform near view and one uniform far
+    view, drawn independently.
     """
 
     views: ClassVar[ViewCounts] = ViewCounts(minimum=2, multiple_of=2)
@@ -56,7 +56,7 @@ class NearFar(Sampler):
         return 1 if self.alternating else self.default_views
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """Return the options without an effect; see `HasUnusedOptions`."""
+        """Return the options that have no effect; see `HasUnusedOptions`."""
         return idle_order(self.order, selection.views_per_step, 2)
 
     @override
@@ -69,12 +69,12 @@ class NearFar(Sampler):
 
 
 class ThreeWay(Sampler):
-    """One near, one middle and one far view per step.
+    """Draws one near, one middle and one far view per step.
 
-    A step has three renders, so compare this sampler with other samplers at equal rendered views,
-    not at equal steps.
+    A step renders three views, so compare this sampler with others at equal numbers of rendered
+    views, not of steps.
 
-    Source: the paper, partition threshold study; groups are thirds of the radial distance.
+    Source: the paper, partition threshold study; its groups are thirds of the radial distance.
     """
 
     views: ClassVar[ViewCounts] = ViewCounts(3, 3)
@@ -89,7 +89,7 @@ class ThreeWay(Sampler):
     )
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """Return the options without an effect; see `HasUnusedOptions`."""
+        """Return the options that have no effect; see `HasUnusedOptions`."""
         return idle_order(self.order, selection.views_per_step, 3)
 
     @override
@@ -99,11 +99,12 @@ class ThreeWay(Sampler):
 
 
 class RandomSplit(Sampler):
-    """K/2 views from each of two random halves of the training views, drawn once at the first step.
+    """Draws K/2 views from each of two random halves of the training views.
 
-    The sampler ignores the grouping of the run, and uses the labels `first` and `second`.
+    The halves are drawn at the first step. The sampler ignores the grouping of the run and labels
+    the halves `first` and `second`.
 
-    Source: the paper announces this control but gives no results.
+    Source: the paper announces this control experiment but gives no results.
     """
 
     views: ClassVar[ViewCounts] = ViewCounts(minimum=2, multiple_of=2)
@@ -118,7 +119,7 @@ class RandomSplit(Sampler):
     )
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """Return the options without an effect; see `HasUnusedOptions`."""
+        """Return the options that have no effect; see `HasUnusedOptions`."""
         return idle_order(self.order, selection.views_per_step, len(HALVES))
 
     @override
@@ -143,11 +144,12 @@ class RandomSplit(Sampler):
 def balanced_draw(
     groups: Mapping[str, Sequence[int]], context: SampleContext, state: PluginState, order: Order
 ) -> tuple[ViewSample, PluginState]:
-    """Return K / len(groups) views of every group; the groups alternate within the step.
+    """Draw K / len(groups) views from every group; the groups alternate within the step.
 
     Args:
-        groups: Label -> positions of its training views, in the order of the draws.
-        context: The step.
+        groups: Label -> indices of the training views in the group; the groups alternate in this
+            order.
+        context: The context of the step.
         state: The state that the previous call of this function returned. With order `epoch` the
             state contains one `EpochOrder` per label.
         order: How views are drawn within a group.
@@ -167,7 +169,7 @@ def balanced_draw(
 
 
 def idle_order(order: Order, views: int, groups: int) -> Mapping[str, str]:
-    """Return the option `order` with a reason if it has no effect, else an empty mapping."""
+    """Return the option `order` and the reason if it has no effect, else an empty mapping."""
     if order != "distinct" or views > groups:
         return {}
     why = "a step has one view of each group, so distinct draws the same views as iid"

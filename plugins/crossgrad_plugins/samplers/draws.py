@@ -1,4 +1,4 @@
-"""Draws of views from a pool or from a group: independent, distinct or epoch by epoch."""
+"""Draws of views from a pool or a group: independent, without repetition, or epoch by epoch."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,10 +14,10 @@ Order = Literal["iid", "distinct", "epoch"]
 
 @dataclass(frozen=True)
 class EpochOrder:
-    """The state of an epoch: a shuffled pool and the number of views already drawn.
+    """The state of an epoch: a shuffled pool, and the number of views that were drawn from it.
 
     Attributes:
-        order: The pool in the order of this epoch.
+        order: The views of the pool, in the order of this epoch.
         drawn_views: Number of views of `order` that have been drawn.
     """
 
@@ -30,10 +30,10 @@ class EpochOrder:
         """Return the next `count` views and the new state; every view occurs once per epoch.
 
         If the epoch ends within a draw, the next epoch begins with views that this draw does not
-        contain yet. So a draw never contains a view twice.
+        yet contain. A draw therefore never contains a view twice.
 
         Args:
-            count: At most the size of the pool.
+            count: Number of views to draw, at most the size of the pool.
             renew: Function that returns the order of a new epoch.
         """
         drawn = list(self.order[self.drawn_views : self.drawn_views + count])
@@ -47,15 +47,15 @@ class EpochOrder:
         return drawn + fresh, EpochOrder(fresh + rest, missing)
 
     def to_json(self) -> dict[str, Json]:
-        """Return the state as plain data.
+        """Return the state as plain data for JSON.
 
-        The list `order` is shared and not copied, because it never changes.
+        The list `order` is not copied, because it never changes.
         """
         return {"order": cast("list[Json]", self.order), "dealt": self.drawn_views}
 
     @staticmethod
     def from_json(data: Json) -> "EpochOrder":
-        """Return the state that `to_json` wrote, or a new state for None."""
+        """Return the state that `to_json` wrote; for None, return a new state."""
         if data is None:
             return EpochOrder()
         values = cast("dict[str, Json]", data)
@@ -65,10 +65,10 @@ class EpochOrder:
 def draw(
     pool: Sequence[int], count: int, order: Order, epoch_order: EpochOrder, rng: np.random.Generator
 ) -> tuple[list[int], EpochOrder]:
-    """Return `count` members of `pool`, and the state of the epoch after the draw.
+    """Draw `count` members of `pool`, and return them with the state of the epoch after the draw.
 
     Raises:
-        UserError: The pool has fewer members than a draw without repetition needs.
+        UserError: A draw without repetition needs more members than the pool has.
     """
     if order == "iid":
         return [int(pool[i]) for i in rng.integers(len(pool), size=count)], epoch_order
@@ -80,7 +80,7 @@ def draw(
 
 
 def require_enough(available: int, count: int) -> None:
-    """Raise an error if a draw needs more different views than there are.
+    """Raise an error if a draw needs more different views than the pool has.
 
     Raises:
         UserError: `count` is larger than `available`.
@@ -96,7 +96,7 @@ def require_enough(available: int, count: int) -> None:
 
 
 def training_views(context: SampleContext) -> range:
-    """Return the positions of all training views.
+    """Return the indices of all training views.
 
     Raises:
         UserError: There are no training views.
@@ -111,20 +111,20 @@ def training_views(context: SampleContext) -> range:
 
 
 def members_of(context: SampleContext) -> Mapping[str, tuple[int, ...]]:
-    """Return the positions of the training views of each label; `near` is first, `far` is last."""
+    """Return the indices of the training views of each label; `near` is first and `far` is last."""
     return _members(context.groups or ())
 
 
 def groups_of(context: SampleContext, sampler: str, expected: int) -> Mapping[str, tuple[int, ...]]:
-    """Return the groups as `members_of` does, after a check of their number.
+    """Return the groups of `members_of` after a check of their number.
 
     Args:
-        context: The step.
+        context: The context of the step.
         sampler: Name of the calling sampler, for the message.
         expected: Number of groups that the sampler needs.
 
     Raises:
-        UserError: There is no grouping, or it has another number of groups.
+        UserError: There is no grouping, or the number of its groups is not `expected`.
     """
     groups = members_of(context)
     if len(groups) != expected:
@@ -139,7 +139,7 @@ def groups_of(context: SampleContext, sampler: str, expected: int) -> Mapping[st
 
 
 def drawn(views: Sequence[int], context: SampleContext) -> ViewSample:
-    """Return the draw of `views`, with their labels if there is a grouping."""
+    """Return the sample with `views`, and with their labels if there is a grouping."""
     groups = context.groups
     labels = None if groups is None else tuple(groups[view] for view in views)
     return ViewSample(tuple(views), labels)
@@ -152,5 +152,5 @@ def _members(labels: tuple[str, ...]) -> Mapping[str, tuple[int, ...]]:
 
 
 def _rank(label: str) -> int:
-    """Return 0 for near, 2 for far, 1 for any other label."""
+    """Return the sort key of a label: 0 for near, 2 for far, 1 for any other label."""
     return {"near": 0, "far": 2}.get(label, 1)

@@ -1,4 +1,4 @@
-"""Farthest-point order of the camera poses."""
+"""Epochs whose views are in farthest-point order of the camera poses."""
 
 from typing import ClassVar
 
@@ -12,13 +12,15 @@ from crossgrad_plugins.samplers.draws import EpochOrder, drawn, require_enough, 
 
 
 class FarthestPoint(Sampler):
-    """Every training view once per epoch, each as far as possible in pose space from earlier views.
+    """Draws every training view once per epoch, in farthest-point order.
 
-    An epoch starts at a random view. A step takes the next K views of the order. A point of pose
-    space is the camera centre and the unit viewing direction times `direction_weight`; distances
-    are Euclidean. The unit of the centre is the root mean square distance from the mean centre;
-    both are computed without stray cameras. (If each step started a new order, the outermost
-    cameras would be rendered far more often than other cameras.)
+    Each next view is as far as possible in pose space from the views before it. An epoch starts at
+    a random view. A step takes the next K views of the order. A point of pose space consists of the
+    camera centre and of the unit viewing direction times `direction_weight`. Distances are
+    Euclidean. Camera centres are divided by their root mean square distance from the mean centre;
+    outlying cameras are left out of this mean and distance. An order lasts for a whole epoch,
+    because a new order in each step would render the outermost cameras far more often than other
+    cameras.
 
     Source: farthest-point sampling, Eldar et al. 1997; the pose space was developed for crossgrad.
     """
@@ -45,22 +47,23 @@ class FarthestPoint(Sampler):
         return drawn(chosen, context), PluginState({"deck": epoch_order.to_json()})
 
     def _poses(self, context: SampleContext) -> NDArray[np.float64]:
-        """Return [N, 6] the training cameras in pose space."""
+        """Return [N, 6] the positions of the training cameras in pose space."""
         scene = context.scene
         centers = context.centers - scene.middle
         robust = scene.robust_centers - scene.middle
         radius = float(np.sqrt((robust**2).sum(axis=1).mean()))
         rows = [view.camera.world_to_camera[2, :3].numpy() for view in scene.train_views]
         directions = np.stack(rows).astype(np.float64)
-        # Cameras at the same position differ only in direction.
+        # If all cameras have one position, only their directions differ.
         scaled = centers / radius if radius > 0.0 else np.zeros_like(centers)
         return np.concatenate([scaled, self.direction_weight * directions], axis=1)
 
 
 def farthest_point_order(points: NDArray[np.float64], start: int) -> list[int]:
-    """Return the order of points [N, D] from `start` on, each the farthest from all earlier points.
+    """Return an order of points [N, D] that starts with `start`.
 
-    Of equally far points, the point with the lowest index is first.
+    Each next point is the farthest from all earlier points. Among equally far points, the lowest
+    index is first.
     """
     order = [start]
     nearest = np.full(len(points), np.inf)

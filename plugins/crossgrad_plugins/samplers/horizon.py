@@ -1,4 +1,4 @@
-"""Far and near views with a ratio that changes once: 2:1, then 1:1."""
+"""Far and near views whose ratio changes once: first 2:1, then 1:1."""
 
 from collections.abc import Mapping
 from typing import ClassVar, cast
@@ -17,17 +17,18 @@ from crossgrad_core.plugin import (
 )
 from crossgrad_plugins.samplers.draws import EpochOrder, draw, drawn, groups_of
 
-#: Number of decimals of a step number that are kept. Further decimals are rounding errors.
+#: Number of decimals to which a step number is rounded. Further decimals contain only rounding
+#: errors.
 _DIGITS = 6
 
 
 class Horizon(Sampler):
-    """Alternates between a far views and b near views; each group has its own epochs.
+    """Draws far and near views in a cycle with a fixed ratio; each group has its own epochs.
 
     The cycle continues across steps, so the ratio is exact for every K.
 
-    Source: Horizon-GS draws aerial : street = 2 : 1 in its coarse stage (60,000 of 100,000 steps)
-    and 1 : 1 in its fine stage.
+    Source: Horizon-GS, which draws aerial and street views at 2 : 1 in its coarse stage (60,000 of
+    100,000 steps), and at 1 : 1 in its fine stage.
     """
 
     views: ClassVar[ViewCounts] = ViewCounts()
@@ -46,7 +47,7 @@ class Horizon(Sampler):
     )
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """Return the options without an effect; see `HasUnusedOptions`."""
+        """Return the options that have no effect; see `HasUnusedOptions`."""
         if 0.0 < self.coarse_share < 1.0:
             return {}
         name, stage = ("coarse", "first") if self.coarse_share == 0.0 else ("fine", "second")
@@ -60,8 +61,8 @@ class Horizon(Sampler):
     @override
     def sample(self, context: SampleContext, state: PluginState) -> tuple[ViewSample, PluginState]:
         near, far = groups_of(context, "horizon", 2).items()
-        # Round the product. 0.29 of 100 steps are 29 steps, but binary floating point gives another
-        # value.
+        # Round the product: a share of 0.29 of 100 steps is 29 steps, but floating-point arithmetic
+        # gives a slightly different value.
         coarse = context.step <= round(self.coarse_share * context.schedule.total, _DIGITS)
         far_turns, near_turns = self.coarse if coarse else self.fine
         turns = [far] * far_turns + [near] * near_turns
@@ -81,7 +82,7 @@ class Horizon(Sampler):
 
 
 def _turn(state: PluginState, coarse: bool) -> int:
-    """Return the position in the cycle of the current stage; 0 at the start of a stage."""
+    """Return the position in the cycle of the current stage; a new stage starts at position 0."""
     if state.values.get("coarse") != coarse:
         return 0
     return cast("int", state.values["turn"])

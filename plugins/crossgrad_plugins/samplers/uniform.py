@@ -18,7 +18,7 @@ from crossgrad_plugins.samplers.draws import EpochOrder, Order, draw, drawn, tra
 
 
 class Random(Sampler):
-    """K uniform training views, independent of each other and of earlier steps.
+    """Draws K uniform training views, independently of each other and of earlier steps.
 
     Source: the paper, `r2view`. Proposition 2 of the paper assumes independent draws, so
     independent draws are the default.
@@ -33,7 +33,7 @@ class Random(Sampler):
     )
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """Return the options without an effect; see `HasUnusedOptions`."""
+        """Return the options that have no effect; see `HasUnusedOptions`."""
         if selection.views_per_step > 1:
             return {}
         return {
@@ -51,12 +51,12 @@ class Random(Sampler):
 
 
 class Epoch(Sampler):
-    """Every training view once per epoch, in a newly shuffled order each time.
+    """Draws every training view once per epoch, in a newly shuffled order each time.
 
-    The K views of a step are different, so K is at most the number of training views.
+    The K views of a step are all different, so K is at most the number of training views.
 
-    Source: 3DGS pops a random element of the remaining views and refills the list when it is empty;
-    a shuffled epoch has the same distribution.
+    Source: 3DGS removes a random element from the list of remaining views, and refills the list
+    when it is empty. A shuffled epoch draws views with equal probabilities.
     """
 
     views: ClassVar[ViewCounts] = ViewCounts()

@@ -1,1 +1,1 @@
-"""`crossgrad check`: tests if points, poses and photos of a scene agree with each other."""
+"""`crossgrad check`: test if points, poses and photos of a scene agree with each other."""

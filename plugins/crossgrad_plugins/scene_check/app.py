@@ -11,14 +11,14 @@ _MOST: Final = 12
 
 
 def lines_of(path: Path, assignments: Sequence[str]) -> list[str]:
-    """Return the notes on a scene, the warnings first, and the verdict.
+    """Return the notes about a scene, warnings first, and the verdict.
 
     Args:
         path: The scene's folder.
-        assignments: `KEY=VALUE` texts as after `--set`.
+        assignments: Texts `KEY=VALUE`, as after `--set`.
 
     Raises:
-        UserError: The scene cannot be read, or it contradicts itself.
+        UserError: The scene cannot be read, or its points, poses and photos contradict each other.
     """
     scene, reader = read_scene(configured(merged(None, {"scene": str(path)}, assignments)))
     results = scene.check or {}

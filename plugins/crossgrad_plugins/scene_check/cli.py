@@ -23,11 +23,12 @@ def check(
         ),
     ] = None,
 ) -> None:
-    """Check whether points, poses and photos of a scene match.
+    """Check if points, poses and photos of a scene match.
 
-    Compares the colours of the SfM points with the photos at the projected positions, as each run
-    does at its start. Prints the photos that do not match, the changes to the input, and the
-    verdict. A scene that does not match as a whole is refused with the likely cause (exit code 2).
+    The command compares the colours of SfM points with the photos at the projected positions. Each
+    run does this at its start, too. It prints photos that do not match, changes to the input, and
+    the verdict. If the whole scene does not match, it is refused with the likely cause (exit code
+    2).
     """
     announce(quiet=False)
     from crossgrad_plugins.scene_check import app

@@ -1,1 +1,1 @@
-"""`crossgrad sweep`: runs of configurations x scenes x seeds, on one machine or on a cluster."""
+"""`crossgrad sweep`: runs of configurations x scenes x seeds, on a machine or a cluster."""

@@ -1,4 +1,4 @@
-"""The command `crossgrad sweep`: from its grid to its summary."""
+"""The command `crossgrad sweep`, from the grid to the summary."""
 
 import signal
 import sys
@@ -42,10 +42,10 @@ _WORDS = "stopping: running runs save a checkpoint first (press again to skip th
 
 @contextmanager
 def noted(stop: Stop) -> Iterator[list[int]]:
-    """Count stop signals inside the `with` block.
+    """Collect the stop signals that arrive inside the `with` block.
 
     Yields:
-        The numbers of the received signals; the list grows while the block runs.
+        The numbers of the received signals, in a list that grows while the block runs.
     """
     came: list[int] = []
 
@@ -63,25 +63,25 @@ def noted(stop: Stop) -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
-#: Default parent folder of sweeps, below the working folder.
+#: Default folder for sweeps, inside the current folder.
 SWEEPS = Path("runs/sweeps")
 
 
 @dataclass(frozen=True)
 class Request:
-    """The request of the user.
+    """The options of the command.
 
     Attributes:
         path: The grid file.
         out: Folder of the sweep.
-        scenes: Scenes that replace the scenes of the grid.
-        seeds: Seeds that replace the seeds of the grid.
-        assignments: `KEY=VALUE` texts that override the grid.
-        workers: Number of runs in parallel.
-        threads: Threads per run.
-        memory: Maximum memory per run, GiB.
-        engine: Name of the engine.
-        options: Options of the engine.
+        scenes: Scenes that replace those of the grid.
+        seeds: Seeds that replace those of the grid.
+        assignments: Texts `KEY=VALUE` that override the grid.
+        workers: Number of runs at the same time.
+        threads: Number of threads per run.
+        memory: Maximum memory of a run, GiB.
+        engine: Name of the engine that starts the runs.
+        options: Options of the engine, as given by the user.
     """
 
     path: Path
@@ -100,7 +100,7 @@ class Sweep:
     """A sweep: its runs and its folder.
 
     Args:
-        request: The request of the user.
+        request: The options of the command.
         read_only: True if no run will be started.
 
     Raises:
@@ -115,7 +115,9 @@ class Sweep:
         self.layout = Layout((request.out or SWEEPS / (grid.name or request.path.stem)).absolute())
         if (
             not read_only
-        ):  # Check before planning, because planning takes time. The lock itself is taken later.
+            # Check the lock before planning, because planning takes time. The lock is acquired
+            # later.
+        ):
             _refuse_a_second(self.layout.out)
             _refuse_what_is_no_sweep(self.layout)
         self.plan = planned(grid, request.path, request.assignments)
@@ -126,11 +128,11 @@ class Sweep:
 
     @property
     def at_a_time(self) -> int:
-        """The number of parallel runs; 1 if it is unknown."""
+        """The number of runs at the same time; 1 if it is unknown."""
         return len(self.machine.cores) if self.machine else self.request.workers or 1
 
     def standings(self, *, alive: bool) -> tuple[Standing, ...]:
-        """Return the state of each run; `alive` is True if a sweep is active in the folder."""
+        """Return the state of each run; `alive` is True if a sweep process works in the folder."""
         return standings(
             self.plan.jobs, self.layout, read_records(self.layout.records), alive=alive
         )
@@ -143,7 +145,7 @@ class Sweep:
         return 0
 
     def foretell(self) -> int:
-        """Print the runs that would be started, and the estimated time of these runs."""
+        """Print the runs that would be started, and their estimated time."""
         states = self.standings(alive=writer_of(self.layout.out) is not None)
         left = [standing for standing in states if standing.state != "finished"]
         ids = {standing.job.id for standing in left}
@@ -156,11 +158,11 @@ class Sweep:
         return 0
 
     def write_best(self, path: Path) -> int:
-        """Write a grid with the best parameters of each arm and scene, for other seeds.
+        """Write a grid with the best parameters of each arm and scene, for new seeds.
 
         Raises:
-            UserError: The best parameters are not known yet, or the file exists or cannot be
-                written.
+            UserError: The best parameters are not known yet, or the file exists, or the file cannot
+                be written.
         """
         check_file(path)
         if path.exists():
@@ -176,7 +178,7 @@ class Sweep:
         return 0
 
     def carry_out(self) -> int:
-        """Carry out the runs that are not finished.
+        """Start all runs that are not finished, and wait for their ends.
 
         Returns:
             The exit code: 0 if all runs are finished, 1 if a run failed, or 128 plus the number of
@@ -202,7 +204,7 @@ class Sweep:
         return self._result(signals)
 
     def _watched(self, before: Sequence[Standing]) -> list[int]:
-        """Carry out the remaining runs and show their progress; return the received signals."""
+        """Start the remaining runs and show their progress; return the received signals."""
         screen = Screen(Watch(self.layout, before), self.at_a_time)
         work = self._work(before)
         with noted(work.stop) as signals:
@@ -212,7 +214,7 @@ class Sweep:
         return signals
 
     def _work(self, before: Sequence[Standing]) -> Work:
-        """Return the arguments of the engine."""
+        """Return the arguments for the engine."""
         request = self.request
         return Work(
             jobs=[standing.job for standing in before if standing.state != "finished"],
@@ -260,7 +262,7 @@ class Sweep:
 
 
 def _grid(request: Request) -> Grid:
-    """Read the grid, and replace its scenes and seeds as the user requested."""
+    """Read the grid, and replace its scenes and seeds if the user requested it."""
     grid = read_grid(request.path)
     check_assignments(request.assignments)
     if request.scenes:

@@ -1,4 +1,7 @@
-"""Attempts at a run: processes that are watched until they end, and repeated if they died."""
+"""Attempts at a run: processes that are watched until they end.
+
+A run whose process dies is started again.
+"""
 
 import os
 import signal
@@ -15,33 +18,32 @@ from crossgrad_core.commands import summary_of, write_settings, writer_of
 from crossgrad_plugins.sweep.job import Job, Layout
 from crossgrad_plugins.sweep.run_status import Status, append, begun, is_finished
 
-#: Seconds between two checks of a process's memory.
+#: Seconds between two checks of the memory of a process.
 _PAUSE = 1.0
 _GIB = 2**30
-#: Seconds between two polls of a process.
+#: Seconds between two checks if a process has ended.
 PAUSE = 0.1
-#: The command that trains a run. The numbers of the cores and the arguments of `crossgrad` are
-#: appended.
+#: The command that trains a run. The core numbers and the arguments of `crossgrad` are appended.
 COMMAND = (sys.executable, "-m", "crossgrad_plugins.sweep.child")
 #: Environment variables that limit the threads of libraries.
 _THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-#: Exit status of a run that was refused.
+#: Exit status of a run whose settings were refused.
 _REFUSED = 2
-#: Maximum number of output lines that are kept to explain a failure.
+#: Maximum number of lines of output that are kept to explain a failure.
 _MOST_LINES = 12
-#: A run has failed if its process died this many times without a new checkpoint.
+#: A run has failed if its process died this many times without a new checkpoint in between.
 MOST: Final = 3
-#: Seconds between two checks of a folder that another process writes into.
+#: Seconds between two checks of a folder into which another process writes.
 _WAIT = 1.0
 
 
 @dataclass
 class Bound:
-    """A memory limit that watches a process.
+    """A memory limit for a process.
 
     Attributes:
-        most: Maximum memory in bytes; None means no limit.
-        taken: Memory in bytes when the limit was exceeded; 0 before.
+        most: Maximum memory in bytes; None for no limit.
+        taken: Memory in bytes when the limit was exceeded; 0 before that.
     """
 
     most: int | None
@@ -50,12 +52,12 @@ class Bound:
 
     @property
     def exceeded(self) -> bool:
-        """True if the process ever exceeded the limit."""
+        """True if the process has exceeded the limit."""
         return self.taken > 0
 
     @property
     def reason(self) -> str:
-        """The message for a process that exceeded the limit."""
+        """The message about a process that exceeded the limit."""
         return (
             f"used {self.taken / _GIB:.1f} GiB, more than the "
             f"{(self.most or 0) / _GIB:.1f} GiB of a run; start fewer --workers, or raise "
@@ -63,7 +65,7 @@ class Bound:
         )
 
     def is_exceeded(self, process: int) -> bool:
-        """Check at intervals whether a process exceeds the limit; return True if it ever did."""
+        """Check at intervals if a process exceeds the limit; return True if it ever exceeded it."""
         if self.most is None or monotonic() - self._looked < _PAUSE:
             return self.exceeded
         self._looked = monotonic()
@@ -87,15 +89,15 @@ def resident_bytes(process: int) -> int | None:
 
 @dataclass(frozen=True)
 class Worker:
-    """A worker that carries out runs, one at a time.
+    """A worker that executes runs, one after the other.
 
     Attributes:
-        name: Name of the worker and of its file of records.
+        name: Name of the worker, and of its file of records.
         out: Folder of the sweep.
-        folder: Working folder of the processes; paths in settings are relative to it.
-        threads: Threads per run.
-        cores: Numbers of the worker's cores; empty means any cores.
-        memory: Maximum memory of a run in bytes; None means no limit.
+        folder: Current folder of the processes; paths in settings are relative to this folder.
+        threads: Number of threads per run.
+        cores: Numbers of the cores of this worker; if empty, any core is used.
+        memory: Maximum memory of a run in bytes; None for no limit.
         command: The command that trains a run.
     """
 
@@ -110,11 +112,11 @@ class Worker:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The outcome of an attempt.
+    """The result of an attempt.
 
     Attributes:
-        status: Finished, or the way in which the attempt ended without finishing.
-        error: The error message; empty without an error.
+        status: `finished`, or how the attempt ended before it was finished.
+        error: The error message, or an empty text.
     """
 
     status: Status
@@ -127,11 +129,11 @@ def is_free(job: Job, worker: Worker) -> bool:
 
 
 class Attempt:
-    """A process that trains a run from the start or from the newest checkpoint of the run.
+    """A process that trains a run, from the start or from the newest checkpoint.
 
     Args:
         job: The run.
-        worker: The worker that carries out the run.
+        worker: The worker that executes the run.
     """
 
     def __init__(self, job: Job, worker: Worker) -> None:
@@ -148,7 +150,7 @@ class Attempt:
             self._process = self._started(output)
 
     def poll(self) -> Outcome | None:
-        """Return the outcome of the process; None while the process runs."""
+        """Return the outcome of the process; None while the process is running."""
         code = self._process.poll()
         if code is None:
             if self._bound.is_exceeded(self._process.pid) and not self._asked:
@@ -171,7 +173,7 @@ class Attempt:
         return outcome
 
     def stop(self) -> None:
-        """Request the run to stop with a checkpoint; a second request skips the evaluation."""
+        """Ask the run to stop with a checkpoint; a second call also skips the final evaluation."""
         self._asked += 1
         self._process.send_signal(signal.SIGTERM)
 
@@ -192,7 +194,7 @@ class Attempt:
             stderr=subprocess.STDOUT,
             cwd=worker.folder,
             env={**os.environ, **dict.fromkeys(_THREADS, str(worker.threads))},
-            # Start a new session, because Ctrl-C in the terminal is meant for the sweep. The sweep
+            # Start a new session, so that Ctrl-C in the terminal reaches only the sweep. The sweep
             # then stops its runs.
             start_new_session=True,
         )
@@ -217,10 +219,10 @@ class Attempt:
         return Outcome("failed", self._reason(folder, code) or f"ended with exit status {code}")
 
     def _reason(self, folder: Path, code: int) -> str:
-        """Return why the run failed: the run's own error, or the last output of its process."""
+        """Return why the run failed: its own error message, or the last output of its process."""
         error = (summary_of(folder) or {}).get("error")
-        # If the run was refused, ignore an existing summary. A refused run writes no summary, so
-        # the file may be from an earlier attempt.
+        # If the run was refused, do not read summary.json. A refused run writes no summary, so an
+        # existing file belongs to an earlier attempt.
         if isinstance(error, str) and code != _REFUSED:
             return error
         with self._layout.output(self.job.id).open("rb") as output:
@@ -231,7 +233,7 @@ class Attempt:
 
 
 def _signal(code: int) -> str:
-    """Return the name of the signal that ended a process; empty without a signal."""
+    """Return the name of the signal that ended a process; empty if no signal did."""
     number = -code if code < 0 else code - 128
     names = {member.value: member.name for member in signal.Signals}
     killed = " (by hand, or because memory was full)" if names.get(number) == "SIGKILL" else ""
@@ -239,7 +241,7 @@ def _signal(code: int) -> str:
 
 
 class Retries:
-    """Counts the deaths of runs between two checkpoints.
+    """Counts how often the process of a run died since the run's last checkpoint.
 
     Args:
         out: Folder of the sweep.
@@ -251,9 +253,9 @@ class Retries:
         self._reached: dict[str, str] = {}
 
     def once_more(self, job: Job, outcome: Outcome, worker: str = "sweep") -> bool:
-        """Return True if a run must be tried again after an attempt.
+        """Return True if a run must be started again after an attempt.
 
-        If a run died too often, a record says that the run failed.
+        If a run died too often, a record states that the run failed.
         """
         if outcome.status != "died":
             return False
@@ -270,20 +272,20 @@ class Retries:
         return False
 
     def _newest(self, job: Job) -> str:
-        """Return the newest checkpoint of a run; empty without a checkpoint."""
+        """Return the newest checkpoint of a run; empty if there is none."""
         folders = self._layout.run(job.id).glob("checkpoints/step-*")
         return max((folder.name for folder in folders), default="")
 
 
 def carried_out(job: Job, worker: Worker, name: str) -> Outcome:
-    """Carry out a run and wait for its end; an interrupt stops the run with a checkpoint.
+    """Execute a run and wait for its end; an interrupt stops the run with a checkpoint.
 
-    If the machine was lost and the task is repeated, the run continues from its files.
+    If a machine is lost and the task is repeated, the run continues from its files.
 
     Args:
         job: The run.
-        worker: The worker that carries out the run.
-        name: Name of the worker in records.
+        worker: The worker that executes the run.
+        name: Name of the worker that is written into records.
     """
     worker = replace(worker, name=name)
     while not is_free(job, worker):

@@ -1,4 +1,4 @@
-"""The best parameters of each arm and scene, tuned on some seeds for tests on further seeds."""
+"""The best parameters of each arm and scene: chosen on some seeds, to be tested on others."""
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -11,12 +11,12 @@ from crossgrad_plugins.sweep.grid import Arm, Choice, Grid, Settings, choices, s
 from crossgrad_plugins.sweep.job import Job
 from crossgrad_plugins.sweep.run_status import Standing, figure
 
-#: Settings that determine the length. A run uses one of them.
+#: Settings that determine the length of a run. A run uses only one of these settings.
 LENGTHS = frozenset({"steps", "max_views", "seconds"})
 #: Number of seeds in the new grid.
 SEEDS = 3
 #: Configuration and scene -> seed -> the metric. The metric is None if the run failed or did not
-#: compute it. A run that has not ended is not in the mapping.
+#: compute the metric. Runs that have not ended are not in the mapping.
 Ends: TypeAlias = Mapping[tuple[str, str], Mapping[int, float | None]]
 
 
@@ -25,20 +25,20 @@ def best_grid(
 ) -> tuple[dict[str, Any], list[str]]:
     """Return a grid with each arm twice: unchanged, and with the best parameters of each scene.
 
-    The seeds of the new grid differ from the seeds on which the parameters were chosen.
+    The seeds of the new grid differ from the seeds with which the parameters were chosen.
 
     Args:
-        grid: The grid in which parameters vary.
+        grid: The grid with the varied parameters.
         cells: All combinations of the grid.
         standings: State of each run.
         folder: Folder of the new grid.
 
-    Returns: The content of the new grid file, and notes. The notes name parameter values with a
-    failed run, which are not candidates, and best values at the end of the tested range.
+    Returns: The content of the new grid file, and notes. Notes name parameter values that are
+    excluded because a run failed, and best values at the end of the tested range.
 
     Raises:
-        UserError: A run of some arm and scene has not ended, all its values failed, or no parameter
-            of the grid varies.
+        UserError: A run of an arm and scene has not ended, all parameter values failed, or the grid
+            varies no parameter.
     """
     if len(choices(grid)) == len(grid.arms):
         raise UserError(
@@ -54,11 +54,11 @@ def best_grid(
     for arm in grid.arms:
         arm_choices = [choice for choice in choices(grid) if choice.arm.name == arm.name]
         if len(arm_choices) == 1:
-            # Only one configuration exists in this arm, so it is the reference for the other arms.
+            # This arm has only one configuration, so it is the reference for the other arms.
             for scene in map(scene_name, grid.scenes):
                 _check_ended([(arm_choices[0], ends[arm_choices[0].label, scene])], scene, grid)
-            # Write the values as parameters, because parameters can override settings, but settings
-            # cannot override settings.
+            # Write the values as parameters, because parameters can override settings, but not the
+            # other way round.
             fixed = {name: {"values": [value]} for name, value in arm_choices[0].parameters.items()}
             as_it_is = {"name": arm.name, "settings": arm.settings, "by_scene": arm.by_scene}
             arms.append({**as_it_is, **({"parameters": fixed} if fixed else {})})
@@ -83,7 +83,7 @@ def best_grid(
 
 
 def _twice(arm: Arm, best: Mapping[str, dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """Yield the arm unchanged, and the arm with its best parameters by scene."""
+    """Yield the unchanged arm, and the arm with its best parameters by scene."""
     shared = {"settings": arm.settings}
     yield {"name": arm.name, **shared, "by_scene": arm.by_scene}
     yield {"name": f"{arm.name}, best", **shared, "by_scene": best}
@@ -92,7 +92,7 @@ def _twice(arm: Arm, best: Mapping[str, dict[str, Any]]) -> Iterator[dict[str, A
 def _with_parameters(chosen: Choice, base: Settings, scene: str | None) -> dict[str, Any]:
     """Return settings by scene that give an arm the chosen parameters.
 
-    Settings by scene that the arm already has override the chosen parameters. If one layer of
+    If the arm already has settings for a scene, they override the chosen parameters. If one set of
     settings cannot express the result, all settings of the best runs are returned.
     """
     arm, name = chosen.arm, scene_name(scene)
@@ -105,11 +105,11 @@ def _with_parameters(chosen: Choice, base: Settings, scene: str | None) -> dict[
 
 
 def _below(values: Mapping[str, Any], overriding: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge values with the settings that override them, in one layer.
+    """Merge values with the settings that override them.
 
-    If a setting chooses another component, the options of the replaced component are dropped. A run
-    has only one length. If a setting sets the length, a length among the values is therefore
-    dropped.
+    If a setting chooses another component, the options of the replaced component are removed. A run
+    has only one length setting. If a setting gives a length, a length among the values is therefore
+    removed.
     """
     lengths = LENGTHS if LENGTHS & overriding.keys() else frozenset()
     components = {name.removesuffix(".name") for name in overriding if name.endswith(".name")}
@@ -123,7 +123,7 @@ def _below(values: Mapping[str, Any], overriding: Mapping[str, Any]) -> dict[str
 
 
 def _ends(grid: Grid, cells: Iterable[Job], standings: Iterable[Standing]) -> Ends:
-    """Return the metric of the runs that have ended."""
+    """Return the metrics of the runs that have ended."""
     by_id = {standing.job.id: standing for standing in standings}
     ends: dict[tuple[str, str], dict[int, float | None]] = {}
     for job in cells:
@@ -136,10 +136,10 @@ def _ends(grid: Grid, cells: Iterable[Job], standings: Iterable[Standing]) -> En
 def _best(
     arm_choices: Sequence[Choice], scene: str, ends: Ends, grid: Grid
 ) -> tuple[Choice, list[str]]:
-    """Return the best configuration of an arm on a scene, and notes on excluded configurations.
+    """Return the best configuration of an arm on a scene, and notes about excluded ones.
 
-    All configurations are compared on the same seeds, so a configuration with a failed run is
-    excluded.
+    All configurations are compared on the same seeds. A configuration with a failed run is
+    therefore excluded.
     """
     results = [(choice, ends[choice.label, scene]) for choice in arm_choices]
     _check_ended(results, scene, grid)

@@ -1,10 +1,9 @@
-"""The process of a run: `crossgrad run`, stopped with a checkpoint when its parent ends.
+"""The process of a run: `crossgrad run`, which stops with a checkpoint if its parent ends.
 
-    python -m crossgrad_plugins.sweep.child CORES ARGUMENT ...
+    Usage: python -m crossgrad_plugins.sweep.child CORES ARGUMENT ...
 
-CORES are the numbers of the cores that the process may use, joined by commas, or `-` for any. The
-standard input is a pipe from the parent process; when the pipe closes, the run is requested to
-stop.
+CORES are the numbers of the allowed cores, joined by commas, or `-` for any core. The standard
+input is a pipe from the parent process. When the pipe closes, the run is asked to stop.
 """
 
 import os
@@ -15,15 +14,15 @@ from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 
-#: File descriptor of standard input. Nothing is ever written to it.
+#: File descriptor of the standard input. The parent never writes to it.
 _PIPE = 0
-#: Linux first divides processors among sessions. The `nice` value of a process counts only within
-#: its session.
+#: Linux first divides the processor time among sessions. The `nice` value of a process counts only
+#: within its session.
 _SESSION_NICENESS = Path("/proc/self/autogroup")
 
 
 def main() -> None:
-    """Run the command line after the cores."""
+    """Run the command line that follows the core numbers."""
     cores, *arguments = sys.argv[1:]
     if cores != "-" and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {int(core) for core in cores.split(",")})
@@ -34,9 +33,9 @@ def main() -> None:
 
 
 def _be_as_nice_as_asked() -> None:
-    """Give the session of this run the niceness of its process."""
+    """Give the session of this run the `nice` value of its process."""
     if (niceness := getattr(os, "nice", lambda _: 0)(0)) > 0:
-        # This fails if the system is not Linux, or if it has no session scheduling.
+        # This fails if the system is not Linux or does not schedule by sessions.
         with suppress(OSError):
             _SESSION_NICENESS.write_text(str(niceness), encoding="ascii")
 

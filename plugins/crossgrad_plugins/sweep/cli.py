@@ -1,4 +1,4 @@
-"""`crossgrad sweep`: many runs, resumable, on all cores of a machine or on a cluster."""
+"""`crossgrad sweep`: many runs that can be resumed, on one machine or on a cluster."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,7 @@ _SHOW = "Options that start no run"
 
 @dataclass(frozen=True)
 class Options:
-    """The options of the command."""
+    """Options of the command."""
 
     grid: Path = argument("GRID", "YAML file with the grid.")
     out: Path | None = option(
@@ -80,10 +80,10 @@ class Options:
 
 @command_of(Options)
 def sweep(given: Options) -> None:
-    """Run a grid of configurations, scenes and seeds, or resume it.
+    """Run a grid of configurations, scenes and seeds, or resume such a grid.
 
-    Every run is a run of `crossgrad run` in its own folder. The name of the folder is a hash of
-    configuration, scene and seed, so that finished runs are never repeated.
+    Every run is executed by `crossgrad run` in a separate folder. The folder is named by a hash of
+    configuration, scene and seed, so that a finished run is never repeated.
     """
     looks = {
         "--dry-run": given.dry_run, "--list": given.list_runs, "--best": given.best is not None

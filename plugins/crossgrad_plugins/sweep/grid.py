@@ -24,19 +24,19 @@ Settings: TypeAlias = dict[str, Any]
 T = TypeVar("T")
 
 _TODO = "docs/sweep.md shows the format"
-#: Maximum number of runs. All runs are planned before the first run starts, and a short grid file
-#: can describe very many runs.
+#: Maximum number of runs of a sweep. All runs are planned before the first run starts, and a short
+#: grid file can describe millions of runs.
 MOST_RUNS = 100_000
-#: Settings that the sweep itself controls -> explanation.
+#: Settings that the sweep itself sets -> explanation for the user.
 _RESERVED = {
     "out": "every run has its own folder below --out",
     "stop_after": "a sweep runs every run to its end",
     "threads": "use --threads, which applies to all runs",
 }
-#: Settings for which the sweep has its own option.
+#: Settings for which the sweep has a separate option.
 _OPTIONS = {"scene": "--scene SCENE", "seed": "--seed N"}
 _SHAPE = "must be `values: [...]`, `value: ...` or `parameters: {...}`"
-#: Error type of pydantic -> message in the terms of YAML instead of Python.
+#: Error type of pydantic -> message for readers of a YAML file.
 _IN_YAML = {"tuple_type": "should be a list", "too_short": "should not be empty"}
 _WITH_DISTRIBUTION = frozenset({"min", "max", "distribution", "mu", "sigma", "q", "probabilities"})
 
@@ -46,12 +46,12 @@ class _Part(BaseModel):
 
 
 class Parameter(_Part):
-    """A setting that varies.
+    """A setting of the grid, with one or several values.
 
     Attributes:
-        values: The values of the setting.
-        value: The only value of the setting, if it does not vary.
-        parameters: Settings inside this setting, such as the options of a component.
+        values: The values, if the setting varies.
+        value: The value, if the setting does not vary.
+        parameters: Settings inside this setting, such as options of a component.
     """
 
     values: tuple[Any, ...] | None = Field(None, min_length=1)
@@ -70,7 +70,7 @@ class Parameter(_Part):
         return given
 
     def axes(self, name: str) -> Iterator[tuple[str, tuple[Any, ...]]]:
-        """Yield each setting with its values; a nested setting has a name with a dot."""
+        """Yield each varied setting with its values; nested settings have names with dots."""
         if self.parameters is not None:
             for inner, parameter in self.parameters.items():
                 yield from parameter.axes(f"{name}.{inner}")
@@ -79,13 +79,13 @@ class Parameter(_Part):
 
 
 class Arm(_Part):
-    """A configuration with a name.
+    """A named configuration of the grid.
 
     Attributes:
         name: Name of the configuration.
         settings: The settings of the configuration.
-        parameters: Settings that vary in this arm, in addition to those that vary in all arms.
-        by_scene: Name of a scene's folder -> settings for that scene only.
+        parameters: Settings that vary in this arm only.
+        by_scene: Name of a scene's folder -> settings for this scene only.
     """
 
     name: str = Field(min_length=1)
@@ -99,7 +99,7 @@ class Metric(_Part):
 
     Attributes:
         name: A metric of the held-out views, as in summary.json.
-        goal: `maximize` or `minimize`; the default is `maximize`, but `minimize` for LPIPS.
+        goal: `maximize` or `minimize`; by default `minimize` for LPIPS, else `maximize`.
     """
 
     name: str = "psnr"
@@ -117,13 +117,13 @@ class Grid(_Part):
     """The contents of a grid file.
 
     Attributes:
-        name: Name of the sweep; by default the name of the file.
+        name: Name of the sweep; by default the name of the grid file.
         description: The purpose of the grid.
-        method: `grid`: every combination is run.
+        method: The value `grid` runs every combination.
         base: Settings of all runs, as in a configuration file.
-        scenes: Scene folders; None is the bundled scene.
-        seeds: Seeds.
-        arms: Configurations by name; by default there is only one.
+        scenes: Scene folders; None stands for the bundled scene.
+        seeds: Seeds of the runs.
+        arms: Named configurations; by default there is one.
         parameters: Settings that vary in all arms.
         metric: The metric of the final table.
     """
@@ -148,7 +148,10 @@ class Grid(_Part):
     @model_validator(mode="before")
     @classmethod
     def _axes_with_names(cls, given: object) -> object:
-        """Move scenes and seeds out of the parameters, where other grid formats list them."""
+        """Move scenes and seeds out of the parameters.
+
+        Other formats of grids list them there.
+        """
         if not isinstance(given, dict) or not isinstance(given.get("parameters"), dict):
             return given
         moved = {"scene": "scenes", "seed": "seeds"}
@@ -162,10 +165,10 @@ class Grid(_Part):
 
 
 def check_assignments(assignments: Iterable[str]) -> None:
-    """Refuse settings that `--set` cannot set for all runs of a sweep.
+    """Refuse settings that cannot be set for all runs of a sweep with `--set`.
 
     Raises:
-        UserError: The sweep controls a setting itself, or has a separate option for it.
+        UserError: The sweep itself sets a setting, or has a separate option for it.
     """
     for name in (assignment.partition("=")[0].strip() for assignment in assignments):
         instead = f"say {_OPTIONS[name]}" if name in _OPTIONS else _RESERVED.get(name)
@@ -174,11 +177,11 @@ def check_assignments(assignments: Iterable[str]) -> None:
 
 
 class Choice(_Part):
-    """One configuration of a grid.
+    """One configuration of a grid: an arm with values for the varied settings.
 
     Attributes:
-        arm: The arm.
-        parameters: Setting -> value, for the settings that vary.
+        arm: The arm of the grid.
+        parameters: Setting -> value, for the varied settings.
     """
 
     arm: Arm
@@ -186,19 +189,19 @@ class Choice(_Part):
 
     @property
     def label(self) -> str:
-        """Name of the configuration in tables."""
+        """The name of the configuration in tables."""
         values = [f"{name}={value}" for name, value in self.parameters.items()]
         return ", ".join([self.arm.name, *values])
 
     def settings(
         self, base: Settings, scene: str | None, assignments: Sequence[str] = ()
     ) -> Settings:
-        """Return the settings of this configuration's runs on a scene, without the seed.
+        """Return the settings of runs of this configuration on a scene, without the seed.
 
         Args:
             base: The settings of all runs of the grid.
-            scene: The scene's folder; None is the bundled scene.
-            assignments: `KEY=VALUE` texts that override the grid.
+            scene: The scene's folder; None stands for the bundled scene.
+            assignments: Texts `KEY=VALUE` that override the grid.
 
         Raises:
             UserError: An assignment, or a key with a dot, is invalid.
@@ -209,14 +212,14 @@ class Choice(_Part):
 
 
 def _values(parameter: object) -> object:
-    """Return the values of a parameter that is not a setting, such as scene or seed."""
+    """Return the values of a parameter that is not a setting of runs, such as scene or seed."""
     if isinstance(parameter, Mapping):
         return parameter.get("values", [parameter.get("value")])
     return parameter
 
 
 def choices(grid: Grid) -> list[Choice]:
-    """Return all configurations, arm by arm; the last parameter varies fastest."""
+    """Return all configurations, arm by arm; the values of the last parameter change fastest."""
     configurations = []
     for arm in grid.arms:
         axes = _axes(grid, arm)
@@ -228,7 +231,7 @@ def choices(grid: Grid) -> list[Choice]:
 
 
 def _axes(grid: Grid, arm: Arm) -> dict[str, tuple[Any, ...]]:
-    """Return the values of the settings that vary in an arm, by setting."""
+    """Return the values of the settings that vary in an arm: setting -> values."""
     parameters = {**grid.parameters, **arm.parameters}
     return dict(axis for name, parameter in parameters.items() for axis in parameter.axes(name))
 
@@ -237,7 +240,7 @@ def read_grid(path: Path) -> Grid:
     """Read the grid in a YAML file.
 
     Raises:
-        UserError: The file cannot be read, or is not a valid grid; the message lists all problems.
+        UserError: The file cannot be read, or the grid is invalid; the message lists all problems.
     """
     content = read_settings(path, "the grid", _TODO)
     try:
@@ -257,7 +260,7 @@ def _absolute(scene: str, here: Path) -> str:
 
 
 def _own(errors: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Drop errors about too few items if the cause is an invalid item of the same list."""
+    """Remove errors about too few items if another error explains the missing item."""
     return [
         error
         for error in errors
@@ -267,7 +270,7 @@ def _own(errors: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
 
 
 def _problem(error: Mapping[str, Any]) -> Problem:
-    """Convert an error of pydantic to a problem with its place in the file."""
+    """Convert an error of pydantic to a problem with its position in the file."""
     path = [part for part in error["loc"] if part != "dict"]
     place = ".".join(str(part) for part in path) or "the grid"
     if error["type"] == "extra_forbidden":
@@ -323,7 +326,7 @@ def _of_the_names(grid: Grid) -> Iterator[Problem]:
 
 
 def _twice(values: Iterable[T]) -> list[T]:
-    """Return the values that occur more than once, in order."""
+    """Return the values that occur several times, in order."""
     return [value for value, number in Counter(values).items() if number > 1]
 
 
@@ -333,12 +336,14 @@ def _number_of_runs(grid: Grid) -> int:
 
 
 def scene_name(scene: str | None) -> str:
-    """Return the name of a scene, which is the name of its folder."""
+    """Return the name of a scene: the name of its folder."""
     return "the bundled scene" if scene is None else Path(scene).name
 
 
 def with_scenes(grid: Grid, scenes: Sequence[Path]) -> Grid:
-    """Return the grid with other scenes; settings by scene are kept for scenes with equal names.
+    """Return the grid with other scenes.
+
+    Settings by scene are kept for scenes with equal names.
 
     Raises:
         UserError: Two scenes have the same name.

@@ -1,4 +1,4 @@
-"""One run of a sweep, its id, and the layout of the sweep's folder."""
+"""A run of a sweep, its id, and the paths in the folder of the sweep."""
 
 import json
 from collections.abc import Mapping
@@ -7,7 +7,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final
 
-#: Settings that change neither the training nor the results.
+#: Settings that affect neither the training nor the results.
 _OF_NO_CONSEQUENCE: Final = (
     *("scene", "out", "threads", "stop_after", "save_every", "decided"),
     *("revisions", "planned_seconds", "planned_views"),
@@ -17,15 +17,15 @@ _DIGITS: Final = 12
 
 @dataclass(frozen=True)
 class Job:
-    """A run.
+    """A run of a sweep.
 
     Attributes:
-        id: The id, which is the name of the run's folder.
+        id: The id of the run, which is also the name of its folder.
         label: Name of the run's configuration.
         scene: Name of the run's scene.
         seed: The seed of the run.
         settings: The settings with which the run is started.
-        seconds: Limit of training seconds; None if another setting limits the length of the run.
+        seconds: Limit of the training time in seconds; None if another setting limits the run.
     """
 
     id: str
@@ -42,11 +42,11 @@ class Job:
 
 
 def run_id(resolved: Mapping[str, Any], fingerprint: str) -> str:
-    """Return the id of a run: a hash of its resolved configuration, with seed, and its scene.
+    """Return the id of a run: a hash of its scene and its resolved configuration with seed.
 
     Args:
-        resolved: The configuration with all options of all components.
-        fingerprint: Digest of the scene, independent of its folder.
+        resolved: The configuration, with all options of all components.
+        fingerprint: Digest of the scene's content, which does not depend on its folder.
     """
     kept = {name: value for name, value in resolved.items() if name not in _OF_NO_CONSEQUENCE}
     if kept.get("seconds") is not None:
@@ -58,16 +58,16 @@ def run_id(resolved: Mapping[str, Any], fingerprint: str) -> str:
 
 @dataclass(frozen=True)
 class Layout:
-    """The folder of a sweep.
+    """The paths in the folder of a sweep.
 
     Attributes:
-        out: The folder.
+        out: The folder of the sweep.
     """
 
     out: Path
 
     def run(self, name: str) -> Path:
-        """Return the results folder of a run of `crossgrad run`."""
+        """Return the folder in which `crossgrad run` writes the results of a run."""
         return self.out / "runs" / name
 
     def settings(self, name: str) -> Path:
@@ -75,12 +75,12 @@ class Layout:
         return self.out / "settings" / f"{name}.yaml"
 
     def output(self, name: str) -> Path:
-        """Return the file with the output of a run's processes."""
+        """Return the file for the output of a run's processes."""
         return self.out / "output" / f"{name}.txt"
 
     @property
     def records(self) -> Path:
-        """The folder of the workers' records, one file for each worker."""
+        """The folder of the records, with one file for each worker."""
         return self.out / "workers"
 
     @property
@@ -89,6 +89,6 @@ class Layout:
         return self.out / "runs.csv"
 
     def make(self) -> None:
-        """Make the folders."""
+        """Create the folders."""
         for path in ("runs", "settings", "output", "workers"):
             (self.out / path).mkdir(parents=True, exist_ok=True)

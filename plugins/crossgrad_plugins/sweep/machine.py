@@ -1,4 +1,7 @@
-"""The number of parallel runs on this machine: each run gets separate cores and enough memory."""
+"""The number of runs at the same time on this machine.
+
+Each run gets separate cores and enough memory.
+"""
 
 import time
 from collections.abc import Sequence
@@ -10,12 +13,11 @@ from pathlib import Path
 from crossgrad_core.commands import UserError, available_cores, available_memory
 
 _GIB = 2**30
-#: Minimum memory of a run, including torch and kernels.
+#: Minimum memory of a run, including torch and compiled kernels.
 LEAST = 3 * _GIB // 2
-#: Maximum share of the available memory for runs.
+#: Maximum share of the available memory that runs may use.
 SHARE = 0.9
-#: The file in which Linux counts the ticks of each core, and the number of seconds between two
-#: readings.
+#: The file in which Linux counts clock ticks of each core, and the seconds between two readings.
 _COUNTS, _LOOK = Path("/proc/stat"), 0.25
 #: The fields of /proc/stat that count idle time and I/O wait.
 _IDLE = slice(3, 5)
@@ -38,12 +40,12 @@ def divided(workers: int | None, threads: int, memory: float | None) -> Machine:
     """Divide this machine among workers.
 
     Args:
-        workers: Number of workers; by default as many as cores and memory allow.
-        threads: Threads per worker.
+        workers: Number of workers; by default the maximum for the available cores and memory.
+        threads: Number of threads per worker.
         memory: GiB per worker; by default an equal share of the available memory.
 
     Raises:
-        UserError: The machine has too few cores, or too little memory.
+        UserError: The machine has too few cores or too little memory.
     """
     cores, there = available_cores(), available_memory()
     by_cores = len(cores) // threads
@@ -69,7 +71,7 @@ def divided(workers: int | None, threads: int, memory: float | None) -> Machine:
 
 
 def idle_first(cores: Sequence[int]) -> tuple[int, ...]:
-    """Return the cores with idle cores first, because another sweep may use some of the cores."""
+    """Return the cores, idle cores first, because another sweep may use some cores."""
     # This fails if the system is not Linux, or if the file has another format.
     with suppress(OSError, ValueError):
         before = _counts()
@@ -82,14 +84,14 @@ def idle_first(cores: Sequence[int]) -> tuple[int, ...]:
 
 
 def _counts() -> dict[int, list[int]]:
-    """Return the ticks of each core in each state so far, by core number."""
+    """Return the clock ticks that each core has spent in each state, by core number."""
     rows = (line.split() for line in _COUNTS.read_text(encoding="ascii").splitlines())
     named = ((row[0].removeprefix("cpu"), row[1:]) for row in rows if row)
     return {int(name): list(map(int, counts)) for name, counts in named if name.isdecimal()}
 
 
 def _busy(before: list[int], after: list[int]) -> float:
-    """Return the share of time, measured in ticks between two counts, in which a core was busy."""
+    """Return the share of time between two readings in which a core was busy."""
     ticks = [late - early for early, late in zip(before, after, strict=True)]
     return 1.0 - sum(ticks[_IDLE]) / max(1, sum(ticks))
 

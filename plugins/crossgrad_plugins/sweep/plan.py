@@ -1,4 +1,4 @@
-"""The plan of a sweep: all runs of a grid, validated and assembled, but not trained."""
+"""The plan of a sweep: all runs of a grid, checked but not trained."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import chdir
@@ -24,7 +24,7 @@ from crossgrad_plugins.sweep.problems import Problem, refuse
 if TYPE_CHECKING:
     from crossgrad_core.commands import RunConfig
 
-#: Maximum number of configurations that are named for one problem.
+#: Maximum number of configurations that the message about a problem names.
 MOST_PLACES = 3
 
 
@@ -34,7 +34,7 @@ class Plan:
 
     Attributes:
         grid: The grid.
-        cells: All combinations, in the order of their runs; two combinations may be the same run.
+        cells: All combinations, in the order of their runs; several combinations can be one run.
     """
 
     grid: Grid
@@ -42,7 +42,7 @@ class Plan:
 
     @property
     def jobs(self) -> tuple[Job, ...]:
-        """The runs of the plan, without repetitions."""
+        """The runs of the plan; each run is listed once."""
         by_id: dict[str, Job] = {}
         for job in self.cells:
             by_id.setdefault(job.id, job)
@@ -52,12 +52,13 @@ class Plan:
 def planned(grid: Grid, path: Path, assignments: Sequence[str] = ()) -> Plan:
     """Plan the runs of a grid.
 
-    Seeds vary slowest, so an interrupted sweep has every configuration with fewer seeds.
+    The seed changes last, so that an interrupted sweep has runs of every configuration for the
+    first seeds.
 
     Args:
         grid: The grid.
-        path: The file of the grid; paths in settings are relative to the folder of this file.
-        assignments: `KEY=VALUE` texts that override the grid.
+        path: The grid file; paths in settings are relative to its folder.
+        assignments: Texts `KEY=VALUE` that override the grid.
 
     Raises:
         GridError: Settings, components or scenes are invalid; the error lists all problems.
@@ -78,7 +79,7 @@ def planned(grid: Grid, path: Path, assignments: Sequence[str] = ()) -> Plan:
 
 @dataclass(frozen=True)
 class _Checked:
-    """A configuration on a scene: its settings, its resolved configuration, the scene's digest."""
+    """A configuration on a scene: its settings, all its options, and the scene's digest."""
 
     settings: Mapping[str, Any]
     resolved: Mapping[str, Any]
@@ -87,7 +88,7 @@ class _Checked:
 
 @dataclass
 class _Planner:
-    """Checks configurations and collects the problems, each problem once."""
+    """Checks configurations and collects problems; each problem is stored once."""
 
     base: Settings
     assignments: tuple[str, ...]
@@ -95,11 +96,11 @@ class _Planner:
     _scenes: dict[str, Any] = field(default_factory=dict)
 
     def problems(self) -> list[Problem]:
-        """Return the problems, with the configurations that they concern."""
+        """Return the problems, and the configurations that have each problem."""
         return [Problem(_shortened(places), text) for text, places in self._wrong.items()]
 
     def checked(self, scene: str | None, choice: Choice) -> _Checked | None:
-        """Check a configuration on a scene; return None if it has a problem."""
+        """Check a configuration on a scene; return None if there is a problem."""
         label = choice.label
         try:
             settings = choice.settings(self.base, scene, self.assignments)
@@ -122,7 +123,7 @@ class _Planner:
         return _Checked(settings, final, scene_parts[2])
 
     def _scene(self, config: "RunConfig") -> Any:  # noqa: ANN401 - a scene, its reader, its digest
-        """Read the scene as configured; return None if it cannot be read."""
+        """Read the scene with the configured options; return None if it cannot be read."""
         key = f"{config.scene} {config.reader} {config.data}"
         if key not in self._scenes:
             try:
@@ -140,13 +141,13 @@ class _Planner:
 
 
 def _shortened(places: Sequence[str]) -> str:
-    """Return the first places, and the number of omitted places."""
+    """Return the first configurations, and the number of those left out."""
     more = len(places) - MOST_PLACES
     return "; ".join([*places[:MOST_PLACES], *([f"and {more} more"] if more > 0 else [])])
 
 
 def _faults(config: "RunConfig") -> Iterator[UserError]:
-    """Yield the errors that the components themselves report."""
+    """Yield the errors that components report about the configuration."""
     for slot, choice in chosen(config):
         try:
             build(slot, choice.name, choice.options)

@@ -17,9 +17,9 @@ class Problem:
     """One problem of a grid.
 
     Attributes:
-        place: The place in the grid.
-        what: The problem.
-        hint: The remedy; empty if none is known.
+        place: The position in the grid.
+        what: Description of the problem.
+        hint: What the user can do; empty if unknown.
     """
 
     place: str
@@ -34,7 +34,7 @@ class Problem:
 
 
 class GridError(UserError):
-    """A grid with all its problems.
+    """The error for a grid, with all its problems.
 
     Args:
         problems: The problems.

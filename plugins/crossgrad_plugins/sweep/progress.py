@@ -13,22 +13,22 @@ from crossgrad_core.commands import controls_of, count, is_live, one_line
 from crossgrad_plugins.sweep.job import Job, Layout
 from crossgrad_plugins.sweep.run_status import Record, Standing, newest_row, read_records
 
-#: Seconds between two reads of the records, and maximum number of failures in the live table.
+#: Seconds between two readings of the records, and maximum number of failures in the live table.
 PAUSE: Final = 1.0
 MOST_FAILURES: Final = 8
-#: Default number of seconds that a run needs in addition to training: for libraries, the scene and
-#: results.
+#: Assumed number of seconds that a run needs besides training: to load libraries and the scene, and
+#: to write results.
 BESIDES = 12.0
 
 
 @dataclass(frozen=True)
 class UnderWay:
-    """An active run.
+    """A run that is active now.
 
     Attributes:
         job: The run.
         record: The record of the start of the run.
-        row: The newest evaluation of the run, column -> text.
+        row: The newest evaluation of the run: column -> text.
     """
 
     job: Job
@@ -38,12 +38,12 @@ class UnderWay:
 
 @dataclass
 class Watch:
-    """The events since the sweep started.
+    """The events of a sweep since its start.
 
     Attributes:
         layout: Folder of the sweep.
-        before: State of each run when the sweep started.
-        ended: Id of a run -> record of its last end since the start of the sweep.
+        before: State of each run at the start of the sweep.
+        ended: Id of a run -> its newest record of an end since the start of the sweep.
         under_way: The active runs.
     """
 
@@ -59,9 +59,9 @@ class Watch:
         self._begun: dict[str, Record] = {}
 
     def look(self) -> list[Record]:
-        """Read new records; return the records of runs that ended since the previous call."""
-        # Compare with known records instead of times. The clocks of machines differ, so a new
-        # record may have an earlier time.
+        """Read new records; return the records of runs that ended since the last call."""
+        # Compare records with known records and not by time. The clocks of machines differ, so a
+        # new record may have an earlier time.
         unread = [entry for entry in read_records(self.layout.records) if entry not in self._known]
         self._known.update(unread)
         new = [entry for entry in unread if entry.run in self._jobs]
@@ -83,7 +83,7 @@ class Watch:
 
     @property
     def finished(self) -> int:
-        """Number of finished runs, including runs that finished earlier."""
+        """Number of finished runs, including runs that were finished before this sweep started."""
         return sum(
             standing.state == "finished" or self._is(standing.job, "finished")
             for standing in self.before
@@ -96,7 +96,7 @@ class Watch:
 
     @property
     def left(self) -> list[Job]:
-        """Runs that are neither finished nor failed, including active runs."""
+        """The runs that are neither finished nor failed, including active runs."""
         return [
             standing.job
             for standing in self.before
@@ -113,7 +113,7 @@ class Screen:
 
     Args:
         watch: The events of the sweep.
-        at_a_time: Number of runs in parallel.
+        at_a_time: Number of runs at the same time.
     """
 
     def __init__(self, watch: Watch, at_a_time: int) -> None:
@@ -124,7 +124,7 @@ class Screen:
         self._last = 0.0
 
     def show(self, *, at_once: bool = False) -> None:
-        """Read the records and show new events, at most once a second."""
+        """Read the records and show new events, at most once per second."""
         if monotonic() - self._last < PAUSE and not at_once:
             return
         self._last = monotonic()
@@ -136,7 +136,7 @@ class Screen:
                 _write(f"... {one_line(self._end(record))}\n")
 
     def close(self) -> None:
-        """Show the final state; a live table is not removed from the screen."""
+        """Show the final state; a live table stays on the screen."""
         self.show(at_once=True)
 
     def _draw(self, lines: list[str]) -> None:
@@ -183,12 +183,12 @@ def _write(text: str) -> None:
 
 @dataclass(frozen=True)
 class Estimate:
-    """The estimated time of some runs, one after another.
+    """The estimated time of runs that are executed one after another.
 
     Attributes:
-        seconds: Wall seconds of the runs with a known time.
-        unknown: Number of runs without a known time.
-        longest: Seconds of the longest run with a known time.
+        seconds: Wall-clock seconds of the runs with an estimate.
+        unknown: Number of runs without an estimate.
+        longest: Wall-clock seconds of the longest run with an estimate.
     """
 
     seconds: float
@@ -196,7 +196,7 @@ class Estimate:
     longest: float = 0.0
 
     def text(self, at_a_time: int) -> str:
-        """Return the estimate as text, for `at_a_time` parallel runs."""
+        """Return the estimate as text, for `at_a_time` runs at the same time."""
         if not self.seconds:
             return (
                 "the time is known after the first finished run"
@@ -212,12 +212,12 @@ class Estimate:
 def estimated(jobs: Sequence[Job], of: Mapping[str, Job], records: Iterable[Record]) -> Estimate:
     """Estimate the time of runs from finished runs of the same configuration and scene.
 
-    Without such runs, the run's budget of seconds or finished runs of the same scene are used.
+    If there are none, the time limit of the run is used, or else finished runs of the same scene.
 
     Args:
         jobs: The runs.
-        of: Id -> run, of all runs that the records may concern.
-        records: The records that the workers wrote.
+        of: Id -> run, for all runs that records may belong to.
+        records: The records of the workers.
     """
     same: dict[tuple[str, ...], list[float]] = {}
     for record in records:
@@ -239,7 +239,7 @@ def _seconds(job: Job, same: Mapping[tuple[str, ...], Sequence[float]]) -> float
 
 
 def duration(seconds: float) -> str:
-    """Format a time for people."""
+    """Return a duration as text, such as minutes and seconds."""
     for unit, size in (("h", 3600), ("min", 60)):
         if seconds >= 2 * size:
             return f"{seconds / size:.{unit == 'h':d}f} {unit}"

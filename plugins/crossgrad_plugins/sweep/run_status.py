@@ -1,4 +1,4 @@
-"""The state of the runs of a sweep, from their folders and from the workers' records."""
+"""The states of a sweep's runs, from their folders and from the records of workers."""
 
 import json
 import os
@@ -14,8 +14,8 @@ from crossgrad_core.commands import disk_errors, read_rows, summary_of
 from crossgrad_plugins.sweep.job import Job, Layout
 
 State = Literal["finished", "failed", "training", "interrupted", "waiting"]
-#: End of an attempt at a run: `stopped` if the sweep stopped it, `died` if it ended in another way
-#: without reporting an error.
+#: How an attempt ended: `stopped` if the sweep stopped it, `died` if it ended without an error
+#: message.
 Status = Literal["finished", "failed", "stopped", "died"]
 
 
@@ -25,9 +25,9 @@ class Standing:
 
     Attributes:
         job: The run.
-        state: The state; an `interrupted` run has started and continues from its checkpoint.
+        state: The state. An `interrupted` run has started, and continues from its checkpoint.
         error: The reason why the run failed.
-        summary: The content of the run's summary.json, if the run is finished.
+        summary: Content of summary.json if the run is finished.
     """
 
     job: Job
@@ -37,22 +37,22 @@ class Standing:
 
 
 def is_finished(folder: Path) -> bool:
-    """Return True if the run in a folder is finished."""
+    """Return True if the folder contains a finished run."""
     return (summary_of(folder) or {}).get("status") == "finished"
 
 
 @dataclass(frozen=True)
 class Record:
-    """A line of a worker's file.
+    """A line in the file of a worker.
 
     Attributes:
-        event: `begun` for the start of an attempt at a run, or `ended`.
+        event: `begun` for the start of an attempt, `ended` for its end.
         run: Id of the run.
         worker: Name of the worker.
-        time: UTC, ISO 8601.
+        time: Time in UTC, ISO 8601.
         host: Name of the machine.
         status: How the attempt ended; None at its start.
-        seconds: Wall seconds of the attempt.
+        seconds: Wall-clock seconds of the attempt.
         error: The error message.
     """
 
@@ -67,7 +67,7 @@ class Record:
 
     @property
     def when(self) -> datetime:
-        """Time of the record."""
+        """The time of the record."""
         return datetime.fromisoformat(self.time)
 
 
@@ -79,8 +79,8 @@ def standings(
     Args:
         jobs: The runs.
         layout: The folder of the sweep.
-        records: The records of the sweep's workers.
-        alive: True if a sweep is active in the folder.
+        records: The records of the workers.
+        alive: True if a sweep process works in the folder.
     """
     last = {record.run: record for record in records}
     return tuple(_standing(job, layout.run(job.id), last.get(job.id), alive=alive) for job in jobs)
@@ -98,24 +98,24 @@ def _standing(job: Job, folder: Path, last: Record | None, *, alive: bool) -> St
 
 
 def figures(standing: Standing) -> dict[str, float]:
-    """Return the finite metrics of all held-out views of a finished run, by name."""
+    """Return the finite metrics of a finished run over all held-out views, by name."""
     overall = (standing.summary or {}).get("overall") or {}
     numbers = ((n, v) for n, v in overall.items() if isinstance(v, int | float))
     return {name: float(value) for name, value in numbers if isfinite(value)}
 
 
 def figure(standing: Standing, name: str) -> float | None:
-    """Return a metric of all held-out views of a finished run; None if missing or not finite."""
+    """Return a metric of a finished run over all held-out views; None if missing or not finite."""
     return figures(standing).get(name)
 
 
 def begun(folder: Path) -> bool:
-    """Return True if a run has a folder from which the run can continue."""
+    """Return True if the folder of a run exists, so that the run can continue."""
     return (folder / "config.yaml").is_file()
 
 
 def newest_row(folder: Path) -> dict[str, str]:
-    """Return the newest evaluation of a run, with a text for each column.
+    """Return the newest evaluation of a run: column -> text.
 
     The result is empty before the first evaluation.
     """
@@ -127,11 +127,11 @@ def newest_row(folder: Path) -> dict[str, str]:
 
 
 def append(folder: Path, record: Mapping[str, Any]) -> None:
-    """Add a record to a worker's file, together with time and machine.
+    """Append a record with time and machine to the file of a worker.
 
     Args:
-        folder: Folder of the workers' files.
-        record: The fields of a `Record`, without time and host.
+        folder: Folder of the record files.
+        record: The fields of a `Record` without time and machine.
 
     Raises:
         UserError: The disk is full, or the folder is read-only.
@@ -147,7 +147,7 @@ def append(folder: Path, record: Mapping[str, Any]) -> None:
 def _add(path: Path, content: str) -> None:
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
     try:
-        # Start with a line end if a killed process left an incomplete line.
+        # Start with a line break, because a killed process may have left an incomplete line.
         os.write(descriptor, (("" if _is_whole(path) else "\n") + content + "\n").encode())
         os.fsync(descriptor)
     finally:
@@ -162,7 +162,10 @@ def _is_whole(path: Path) -> bool:
 
 
 def read_records(folder: Path) -> list[Record]:
-    """Read the records of all workers, ordered by time, without incomplete or invalid lines."""
+    """Read the records of all workers, ordered by time.
+
+    Incomplete or invalid lines are skipped.
+    """
     paths = sorted(folder.glob("*.jsonl"))
     return sorted(
         (record for path in paths for record in _lines(path)), key=lambda record: record.time

@@ -20,7 +20,7 @@ _COLUMNS = ("run", "scene", "configuration", "seed")
 
 
 def listing(cells: Iterable[Job], standings: Iterable[Standing]) -> Iterator[str]:
-    """Yield a line for each combination: id, state and description."""
+    """Yield one line for each combination: id, state and description."""
     state = {entry.job.id: entry for entry in standings}
     for job in cells:
         standing = state[job.id]
@@ -29,10 +29,10 @@ def listing(cells: Iterable[Job], standings: Iterable[Standing]) -> Iterator[str
 
 
 def table(cells: Sequence[Job], standings: Iterable[Standing], metric: Metric) -> Iterator[str]:
-    """Yield a table of a metric, configurations x scenes: mean and standard deviation over seeds.
+    """Yield a table of a metric: configurations x scenes, with mean and deviation over seeds.
 
     An asterisk marks the best mean of each scene. If no finished run has the metric, a line lists
-    the metrics that the runs have.
+    the available metrics.
     """
     all_standings = tuple(standings)
     values = {standing.job.id: figure(standing, metric.name) for standing in all_standings}
@@ -75,9 +75,10 @@ def _cell(values: Sequence[float] | None, best: float | None) -> str:
 
 
 def write_plan(layout: Layout, cells: Iterable[Job]) -> None:
-    """Write runs.csv, the table of runs; rows of earlier grids in the folder follow at the end.
+    """Write runs.csv, the table of runs.
 
-    A run that is in both grids keeps the name that it has in the new grid.
+    Rows of earlier grids in the folder follow at the end. A run that belongs to both grids gets its
+    name in the new grid.
     """
     rows = [(job.id, job.scene, job.label, str(job.seed)) for job in cells]
     ids = {run for run, *_ in rows}
@@ -92,10 +93,10 @@ def write_plan(layout: Layout, cells: Iterable[Job]) -> None:
 
 
 def earlier_rows(layout: Layout) -> frozenset[tuple[str, str]]:
-    """Return run and configuration of the rows of runs.csv that belong to earlier grids.
+    """Return run and configuration of rows in runs.csv that belong to earlier grids.
 
-    The rows of the newest grid come first. A row belongs to an earlier grid if a row above it has
-    another run of the same scene, configuration and seed, even if this other run has not finished.
+    The rows of the newest grid come first. A row belongs to an earlier grid if a row above it names
+    another run of the same scene, configuration and seed. The other run need not be finished.
 
     Raises:
         UserError: The table cannot be read.
@@ -109,10 +110,10 @@ def earlier_rows(layout: Layout) -> frozenset[tuple[str, str]]:
 
 
 def _read_plan(layout: Layout, *, writes: bool = False) -> list[list[str]]:
-    """Return the rows of runs.csv; empty if there is no such table or if it has other columns.
+    """Return the rows of runs.csv; empty if the table does not exist or has other columns.
 
     Raises:
-        UserError: The table cannot be read, or `writes` would overwrite a table with other columns.
+        UserError: The table cannot be read, or a table with other columns would be overwritten.
     """
     if not layout.plan.is_file():
         return []

@@ -207,7 +207,7 @@ def stress(*arguments):
 def test_the_command_searches_and_repeats_a_printed_case():
     found = stress("symmetric", "--search", "0.01", "--type", "float32")
     assert found.exit_code == 0, found.output
-    assert "nothing outside what is stated" in found.output
+    assert "no broken guarantee" in found.output
     rows = found.output.split("--rows '", 1)[1].split("'", 1)[0]
     assert len(json.loads(rows)) >= 2
     assert stress("symmetric", "--rows", rows, "--type", "float32").exit_code == 0
@@ -219,7 +219,7 @@ def test_a_failed_search_ends_with_exit_code_1(monkeypatch):
     monkeypatch.setattr(suite, "subject_of", lambda _name: symmetric_as(Off()))
     found = stress("symmetric", "--search", "0.01", "--type", "float32")
     assert found.exit_code == 1
-    assert "broken promises" in found.output
+    assert "broken guarantees" in found.output
 
 
 def test_the_command_checks_thousands_of_matrices(monkeypatch):

@@ -22,16 +22,17 @@ from crossgrad_core.plugin import (
     screen_statistics,
 )
 
-#: Sums per anchor [P]: opacities of its Gaussians, and number of views that decoded it.
+#: Sums for each anchor [P]: opacities of its Gaussians, and number of views that decoded it.
 OPACITY, VIEWS = "opacity", "views"
-#: Sums per offset [P, k]: gradient norms of its Gaussian, and number of renders that show it.
+#: Sums for each offset [P, k]: gradient norms of its Gaussian, and number of renders in which this
+#: Gaussian is visible.
 GRADIENT, RENDERS = "gradient", "renders"
 
 
 def observed(context: DensifyContext, state: PluginState) -> PluginState:
-    """Add the statistics of this step's views to the running sums.
+    """Add the statistics of the views of this step to the sums.
 
-    Source: Scaffold-GS, section 3.3; methods of section 2.5.
+    Source: Scaffold-GS, section 3.3.
     """
     totals = _copies(context, state)
     for record in context.views:
@@ -70,18 +71,21 @@ def _add(record: ViewRecord, totals: Mapping[str, Tensor]) -> None:
 
 @dataclass(frozen=True)
 class GrowthRequest:
-    """A request for new anchors at offsets of the present anchors.
+    """A request for new anchors at the Gaussians of present anchors.
 
     Attributes:
-        gradient: [P, k] mean gradient norm of each offset, NDC.
-        eligible: [P, k] bool, offsets that were visible often enough for a decision.
+        gradient: [P, k] mean gradient norm of each offset, in NDC units.
+        eligible: [P, k] bool, True for offsets that were visible often enough for a decision.
     """
 
     gradient: Tensor
     eligible: Tensor
 
     def among(self, may_grow: Tensor | None) -> "GrowthRequest":
-        """Restrict the request to the anchors that may grow [P]; None means all anchors."""
+        """Restrict the request to anchors for which `may_grow` [P] is True.
+
+        If `may_grow` is None, all anchors may grow.
+        """
         if may_grow is None:
             return self
         return replace(self, eligible=self.eligible & may_grow[:, None])
@@ -89,15 +93,15 @@ class GrowthRequest:
 
 @dataclass(frozen=True)
 class NewAnchors:
-    """M anchors to be added.
+    """M new anchors that an edit adds.
 
     Attributes:
-        positions: [M, 3] local units.
-        cells: [M] edge of the cell of each anchor, local units.
-        features: [M, F].
-        parents: [M] int64, the anchor whose offset requested each new anchor.
-        strength: [M] the largest gradient among the requests for each new anchor.
-        further: Tensor name -> [M, ...], other tensors that are not copied from the parents.
+        positions: [M, 3] positions in local units.
+        cells: [M] edge of each anchor's cell in local units.
+        features: [M, F] feature vectors.
+        parents: [M] int64, the anchor that requested each new anchor.
+        strength: [M] largest gradient of all requests for each new anchor.
+        further: Other tensors [M, ...], by name, that are not copied from the parents.
     """
 
     positions: Tensor
@@ -111,7 +115,10 @@ class NewAnchors:
         return int(self.positions.shape[0])
 
     def limited(self, room: int) -> tuple["NewAnchors", int]:
-        """Return the `room` strongest anchors in unchanged order, and the count of dropped ones."""
+        """Return at most `room` anchors, and the number of dropped anchors.
+
+        Anchors with large gradients are preferred, and the order does not change.
+        """
         left_out = max(0, len(self) - room)
         if left_out == 0:
             return self, 0
@@ -119,7 +126,10 @@ class NewAnchors:
         return self.at(ranked[:room].sort().values), left_out
 
     def and_more(self, more: "NewAnchors") -> "NewAnchors":
-        """Append anchors that have the same set of further tensors."""
+        """Append anchors.
+
+        The present and the appended anchors must have the same names in `further`.
+        """
         return NewAnchors(
             torch.cat([self.positions, more.positions]),
             torch.cat([self.cells, more.cells]),
@@ -145,11 +155,11 @@ class NewAnchors:
 
 
 class AnchorDensifier(Densifier):
-    """A densifier that adds anchors at large offset gradients and removes transparent anchors.
+    """A densifier that adds anchors where gradients are large, and removes transparent anchors.
 
-    A subclass decides which anchors are added; everything else follows Scaffold-GS. Counters of an
-    offset or an anchor are cleared after a decision about it. A rarely seen anchor therefore keeps
-    its counters until it has been seen often enough for a decision.
+    A subclass decides where anchors are added. All other rules are the rules of Scaffold-GS. After
+    a decision about an offset or an anchor, its sums are reset to zero. An anchor that is rarely
+    visible keeps its sums, until they suffice for a decision.
     """
 
     tensors: ClassVar[frozenset[str]] = frozenset({"anchors", "offsets", "features", "scales"})
@@ -178,16 +188,19 @@ class AnchorDensifier(Densifier):
     def grown(
         self, context: DensifyContext, parameters: Parameters, request: GrowthRequest
     ) -> NewAnchors:
-        """Return the anchors to be added for the requests of the offsets.
+        """Return the anchors that are added for the requests.
 
         Args:
-            context: The step.
-            parameters: The parameters of the anchors, detached.
-            request: The requests of the offsets.
+            context: The context of the step.
+            parameters: The parameters, detached from autograd.
+            request: The requests for new anchors.
         """
 
     def changed(self, parameters: Parameters, request: GrowthRequest) -> Mapping[str, Tensor]:
-        """Return new rows of tensors [P, ...] of the present anchors; by default capped scales."""
+        """Return new values [P, ...] for tensors of the present anchors.
+
+        By default, the log scales of Gaussians are limited.
+        """
         scales = parameters["scales"]
         capped = scales[:, 3:].clamp(max=self.largest_log_scale)
         return {"scales": torch.cat([scales[:, :3], capped], 1)}
@@ -196,7 +209,7 @@ class AnchorDensifier(Densifier):
     def densify(self, context: DensifyContext, state: PluginState) -> tuple[Edit, PluginState]:
         if not context.schedule.collects(context.step):
             return NO_EDIT, PluginState()
-        # In the published schedule, statistics are collected from step 500 on and edits begin at
+        # In the published schedule, statistics are collected from step 500 on, and edits begin at
         # step 1500.
         if context.schedule.counted(context.step) > context.schedule.densify_from // 3:
             state = observed(context, state)
@@ -225,7 +238,7 @@ class AnchorDensifier(Densifier):
 def edit_of(
     parameters: Parameters, changed: Mapping[str, Tensor], pruned: Tensor, new: NewAnchors
 ) -> Edit:
-    """Make the edit that changes present anchors, removes `pruned` [P] and adds `new`."""
+    """Create the edit that changes present anchors, removes `pruned` [P] and adds `new` anchors."""
     really = {n: rows for n, rows in changed.items() if not torch.equal(rows, parameters[n])}
     if len(new) == 0 and not bool(pruned.any()):
         return Edit(values={name: Rows(rows, keep_moments=True) for name, rows in really.items()})
@@ -242,7 +255,10 @@ def edit_of(
 
 
 def _first_values(parameters: Parameters, new: NewAnchors) -> dict[str, Tensor]:
-    """Return initial values of new anchors; other tensors are copied from their parents."""
+    """Return the initial values of new anchors.
+
+    Tensors that are not included are copied from the parents.
+    """
     scales, offsets = parameters["scales"], parameters["offsets"]
     return {
         "anchors": new.positions,
@@ -254,18 +270,21 @@ def _first_values(parameters: Parameters, new: NewAnchors) -> dict[str, Tensor]:
 
 
 def _cleared(state: PluginState, eligible: Tensor, judged: Tensor) -> dict[str, Tensor]:
-    """Return the sums, cleared for eligible offsets and for anchors with a decision."""
+    """Return the sums after a reset for eligible offsets and for anchors with a decision."""
     done = {GRADIENT: eligible, RENDERS: eligible, OPACITY: judged, VIEWS: judged}
     return {name: state.per_primitive[name].masked_fill(done[name], 0.0) for name in done}
 
 
 def offset_means(parameters: Mapping[str, Tensor], anchor: Tensor, slot: Tensor) -> Tensor:
-    """Return the means [N, 3] of the Gaussians `slot` [N] of anchors `anchor` [N]."""
+    """Return the means [N, 3] of the Gaussians in slots `slot` [N] of anchors `anchor` [N]."""
     stretch = torch.exp(parameters["scales"][anchor, :3])
     return parameters["anchors"][anchor] + parameters["offsets"][anchor, slot] * stretch
 
 
 def largest(rows: Tensor, group: Tensor, groups: int) -> Tensor:
-    """Return the elementwise maximum [groups, F] of the rows [N, F] of each non-empty group."""
+    """Return the elementwise maximum [groups, F] over the rows [N, F] of each group.
+
+    Empty groups get -inf.
+    """
     largest = rows.new_full((groups, rows.shape[1]), -torch.inf)
     return largest.scatter_reduce_(0, group[:, None].expand_as(rows), rows, "amax")

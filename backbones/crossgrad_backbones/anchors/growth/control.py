@@ -1,4 +1,4 @@
-"""Growing and pruning of anchors (Scaffold-GS, Lu et al. 2024, section 3.3)."""
+"""Grow and prune anchors (Scaffold-GS, Lu et al. 2024, section 3.3)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -23,12 +23,12 @@ from crossgrad_core.plugin import DensifyContext, Parameters, Schedule, Selectio
 
 @dataclass(frozen=True)
 class Level:
-    """One cell size of the growth, with its threshold.
+    """A cell size at which anchors are added, with its threshold.
 
     Attributes:
-        cell: Edge of a cell, local units.
-        threshold: Least gradient that adds an anchor, NDC norm.
-        keep: Probability of keeping a candidate.
+        cell: Edge of a cell in local units.
+        threshold: Smallest gradient norm for which an anchor is added, in NDC units.
+        keep: Probability with which a candidate is kept.
     """
 
     cell: float
@@ -43,19 +43,22 @@ def grown(
     levels: tuple[Level, ...],
     rng: np.random.Generator,
 ) -> NewAnchors:
-    """Return new anchors from the offsets of the present anchors, level by level.
+    """Return new anchors at the Gaussians of the present anchors.
 
-    Growth stops after the first level if that level adds no anchor. Anchors added in this call
-    occupy their cells but are not sources of further growth.
+    The levels are processed in order.
+
+    If the first level adds no anchor, the other levels are skipped. At each later level, growth
+    also ends if no anchor has been added so far. Anchors that were added at earlier levels occupy
+    their cells, but request no anchors.
 
     Args:
         parameters: `anchors` [P, 3], `offsets` [P, k, 3], `features` [P, F], `scales` [P, 6].
-        gradient: [P, k] mean gradient norm of each offset.
-        eligible: [P, k] bool, offsets that were seen often enough.
-        levels: From coarse to fine.
-        rng: Draws the candidates that are kept.
+        gradient: [P, k] mean gradient norm of each offset, in NDC units.
+        eligible: [P, k] bool, True for offsets that were visible often enough.
+        levels: The levels, from coarse to fine cells.
+        rng: Random generator that chooses which candidates are kept.
 
-    Source: Scaffold-GS, section 3.3; methods of section 2.6.
+    Source: Scaffold-GS, section 3.3.
     """
     added = _at_level(parameters, parameters["anchors"], gradient, eligible, levels[0], rng)
     for level in levels[1:]:
@@ -74,7 +77,10 @@ def _at_level(
     level: Level,
     rng: np.random.Generator,
 ) -> NewAnchors:
-    """Return new anchors of one level in cells without a present anchor [N, 3]."""
+    """Return the new anchors of one level.
+
+    The cells of the new anchors contain none of the `present` anchors [N, 3].
+    """
     anchor, slot = (eligible & (gradient >= level.threshold)).nonzero().unbind(1)
     kept = torch.from_numpy(rng.random(len(anchor)) < level.keep).to(anchor.device)
     anchor, slot = anchor[kept], slot[kept]
@@ -93,7 +99,7 @@ def _at_level(
 
 
 class AnchorControl(AnchorDensifier):
-    """A densifier that grows anchors into free cells of several sizes, coarse cells first."""
+    """A densifier that adds anchors in empty cells of several sizes, coarse cells first."""
 
     tensors: ClassVar[frozenset[str]] = AnchorDensifier.tensors | {"voxel_size"}
 
@@ -105,7 +111,7 @@ class AnchorControl(AnchorDensifier):
     refinement: int = Field(4, ge=2, description="ratio of the edges of successive levels")
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """Return the options without an effect; see `HasUnusedOptions`."""
+        """Return the options that have no effect (see `HasUnusedOptions`)."""
         if self.levels > 1:
             return {}
         why = "there is only one cell size (levels = 1); leave the option out"
@@ -128,7 +134,7 @@ class AnchorControl(AnchorDensifier):
         return grown(parameters, request.gradient, request.eligible, levels, context.rng)
 
     def _levels(self, voxel: float) -> tuple[Level, ...]:
-        """Return the growth levels for voxels with this edge."""
+        """Return the growth levels for voxels with the edge `voxel`."""
         return tuple(
             Level(
                 cell=voxel * max(1, self.coarsest // self.refinement**level),

@@ -1,4 +1,4 @@
-"""The frustum filter of the anchors (CPU, float32)."""
+"""The frustum filter of the anchors (Numba, CPU, float32)."""
 
 import math
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from crossgrad_core.numerics.jit import kernel
 from crossgrad_core.numerics.jobs import Jobs, next_job
 
-#: Number of anchors that one thread processes at a time.
+#: Number of anchors in one job of the work queue.
 SHARE = 4096
 
 
@@ -24,19 +24,21 @@ def in_frustum(
     reach: np.float32,
     inside: NDArray[np.bool_],
 ) -> None:
-    """Write a mask of the anchors that pass, with the same formulas as the plain filter.
+    """Write a mask of the anchors inside the frustum.
+
+    The formulas are those of the torch version, `_plain`.
 
     Args:
-        jobs: From `parallel` or `serial`.
-        positions: [P, 3].
-        log_scales: [P, 3 or more].
-        pose: [3, 4] world to camera.
-        axes: [2, 6] for x and y: focal length, centre, least and largest slope of the Jacobian,
-            first and last position that counts (pixels).
-        near: Least depth.
-        dilation: Added to the variances, px^2.
-        reach: Extent of a footprint, standard deviations.
-        inside: [P] output.
+        jobs: Job counters, passed by `parallel` or `serial`.
+        positions: [P, 3] positions.
+        log_scales: [P, 3 or more] log scales.
+        pose: [3, 4] world-to-camera transform.
+        axes: [2, 6] values for x and for y: focal length, principal point, smallest and largest
+            slope of the Jacobian, first and last pixel centre.
+        near: Smallest depth.
+        dilation: Number that is added to the variances, in px^2.
+        reach: Half extent of a footprint in standard deviations.
+        inside: [P] output, True inside the frustum.
     """
     count = len(positions)
     chunks = (count + SHARE - 1) // SHARE
@@ -53,7 +55,7 @@ def in_frustum(
                 along = pose[k, 0] * x + pose[k, 1] * y + pose[k, 2] * z + pose[k, 3]
                 slope = along / depth
                 projected = focal * slope + center
-                # A centre inside the image needs no further test.
+                # If the centre is inside the image, no further test is needed.
                 if axes[k, 4] <= projected <= axes[k, 5]:
                     continue
                 clamped = min(max(slope, axes[k, 2]), axes[k, 3])

@@ -1,9 +1,10 @@
-"""Kernels before and after the matrix products of the networks, up to the Gaussians.
+"""Kernels that prepare the inputs of the networks and convert their outputs to Gaussians.
 
-All arrays are rows of floats in C order: A anchors in view, k slots each, P anchors in total, G
-Gaussians with positive opacity. A kernel processes a stretch of n anchors starting at `first`; raw
-values exist only for this stretch. Anchors are divided into shares of a fixed size. Every share
-writes its own rows, so the bits do not depend on the number of threads.
+All arrays are in C order. A is the number of visible anchors, and P is the number of all anchors.
+Each anchor has k slots. G is the number of Gaussians with positive opacity. A kernel processes a
+stretch of n anchors from number `first` on. Raw outputs exist only for this stretch. The anchors
+are divided into jobs of a fixed number of anchors. Every job writes its own rows. The bits do not
+depend on the number of threads, because every job writes its own rows.
 """
 
 from typing import TypeAlias
@@ -17,13 +18,17 @@ from crossgrad_core.numerics.jobs import Jobs, next_job
 
 _Floats: TypeAlias = NDArray[np.float32]
 _Ints: TypeAlias = NDArray[np.int64]
-#: Number of rows that one thread processes at a time.
+#: Number of anchors in one job of the work queue.
 SHARE = 256
 
 
 @kernel
 def join(jobs: Jobs, features: _Floats, rows: _Ints, views: _Floats, out: _Floats) -> None:
-    """Write [A, F + V]: rows [A] of the features [Q, F], then the views [A, V]."""
+    """Write the inputs of the networks [A, F + V].
+
+    The inputs of an anchor are its row of the features [Q, F], followed by its row of the views [A,
+    V].
+    """
     anchors, feature, view = len(rows), features.shape[1], views.shape[1]
     chunks = (anchors + SHARE - 1) // SHARE
     chunk = next_job(jobs, chunks)
@@ -44,15 +49,15 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 def rectify_back(
     jobs: Jobs, first: int, anchors: int, column: int, hidden: _Floats, gradient: _Floats
 ) -> None:
-    """Set the gradient to 0, in place, for hidden values that are 0.
+    """Set the gradient to 0, in place, where the hidden value is 0.
 
     Args:
-        jobs: From `parallel` or `serial`.
-        first: The first anchor.
-        anchors: n.
-        column: Column of `hidden` that corresponds to the gradient's first column.
-        hidden: [A, 3 H] rectified values.
-        gradient: [n or more, H or 3 H].
+        jobs: Job counters, passed by `parallel` or `serial`.
+        first: Number of the first anchor.
+        anchors: Number of anchors n.
+        column: Column of `hidden` that belongs to the first column of the gradient.
+        hidden: [A, 3 H] hidden values after the ReLU.
+        gradient: [n or more, H or 3 H] gradients, changed in place.
     """
     width = gradient.shape[1]
     chunks = (anchors + SHARE - 1) // SHARE
@@ -68,7 +73,10 @@ def rectify_back(
 
 @kernel
 def count(opacities: _Floats, starts: _Ints) -> None:
-    """Write [A + 1] starts: the positive opacities [A, k] of anchor a begin at starts[a]."""
+    """Write `starts` [A + 1], the index of the first Gaussian of each anchor.
+
+    The array of opacities has the shape [A, k].
+    """
     anchors, slots = opacities.shape
     total = 0
     for a in range(anchors):
@@ -99,27 +107,27 @@ def gather(
     out_opacities: _Floats,
     out_colors: _Floats,
 ) -> None:
-    """Write the values of the Gaussians with positive opacity.
+    """Write the values of all Gaussians with positive opacity.
 
     Args:
-        jobs: From `parallel` or `serial`.
-        first: The first anchor.
-        covariances: [n, 7 k] raw.
-        colors: [n, 3 k] raw.
-        opacities: [A, k] as drawn.
-        positions: [P, 3].
-        offsets: [P, k, 3].
-        spreads: [A, 6] stretch of the offsets, size of the Gaussians.
-        rows: [A] row of each anchor.
-        starts: [A + 1] from `count`.
-        origin: [G] written.
-        slot: [G] written.
-        out_means: [G, 3] written.
-        out_quats: [G, 4] written, raw.
-        out_shares: [G, 3] written, raw.
-        out_sizes: [G, 3] written, the size of the anchor.
-        out_opacities: [G] written.
-        out_colors: [G, 3] written, raw.
+        jobs: Job counters, passed by `parallel` or `serial`.
+        first: Number of the first anchor.
+        covariances: [n, 7 k] raw outputs.
+        colors: [n, 3 k] raw outputs.
+        opacities: [A, k] opacities for rendering.
+        positions: [P, 3] positions of all anchors.
+        offsets: [P, k, 3] offsets of all anchors.
+        spreads: [A, 6] factors of the offsets, then sizes of the Gaussians.
+        rows: [A] row of each visible anchor.
+        starts: [A + 1] index of the first Gaussian of each anchor, from `count`.
+        origin: [G] output, row of the anchor.
+        slot: [G] output, slot of the anchor.
+        out_means: [G, 3] output.
+        out_quats: [G, 4] output, raw.
+        out_shares: [G, 3] output, raw scales.
+        out_sizes: [G, 3] output, size of the anchor.
+        out_opacities: [G] output.
+        out_colors: [G, 3] output, raw.
     """
     anchors, slots = len(covariances), opacities.shape[1]
     chunks = (anchors + SHARE - 1) // SHARE
@@ -166,29 +174,31 @@ def scatter(
     v_colors: _Floats,
     out_offsets: _Floats,
 ) -> None:
-    """Compute the gradients of all inputs from the gradients of all outputs.
+    """Compute the gradients with respect to all inputs, given the gradients of all outputs.
 
     Args:
-        jobs: From `parallel` or `serial`.
-        first: The first anchor.
-        anchors: n.
-        rows: [A].
-        starts: [A + 1].
-        slot: [G].
-        spreads: [A, 6].
-        shares: [G, 3] scales divided by the anchor's size.
-        v_scales: [G, 3] gradient of the scales.
-        out_log_scales: [P, 6] zero, written at `rows`.
-        raw: [n or more, 11 k] output: gradient of the raw opacities, covariances and colours.
-        tanhs: [A, k] opacities before the factor.
+        jobs: Job counters, passed by `parallel` or `serial`.
+        first: Number of the first anchor.
+        anchors: Number of anchors n.
+        rows: [A] row of each visible anchor.
+        starts: [A + 1] index of the first Gaussian of each anchor.
+        slot: [G] slot of each Gaussian.
+        spreads: [A, 6] exponentials of the log scales.
+        shares: [G, 3] scales divided by the size of the anchor.
+        v_scales: [G, 3] gradient with respect to the scales.
+        out_log_scales: [P, 6] output, zero before the call, written at `rows`.
+        raw: [n or more, 11 k] output: gradients with respect to raw opacities, covariances and
+            colours.
+        tanhs: [A, k] opacities before multiplication by the factor.
         factors: [A] factors of the opacities.
-        offsets: [P, k, 3].
-        colors: [G, 3] as drawn.
-        v_means: [G, 3] gradient of the means.
-        v_quats: [G, 4] gradient of the quaternions.
-        v_opacities: [G] gradient of the opacities.
-        v_colors: [G, 3] gradient of the colours.
-        out_offsets: [P, k, 3] zero, written at the drawn slots of `rows`.
+        offsets: [P, k, 3] offsets of all anchors.
+        colors: [G, 3] colours for rendering.
+        v_means: [G, 3] gradient with respect to the means.
+        v_quats: [G, 4] gradient with respect to the quaternions.
+        v_opacities: [G] gradient with respect to the opacities.
+        v_colors: [G, 3] gradient with respect to the colours.
+        out_offsets: [P, k, 3] output, zero before the call, written at the rendered slots of
+            `rows`.
     """
     slots = tanhs.shape[1]
     to_colors = (1 + COVARIANCE) * slots
@@ -232,7 +242,10 @@ def scatter_scales(
     out_log_scales: _Floats,
     raw: _Floats,
 ) -> None:
-    """Run `scatter` for scale gradients only; `raw` [n, 7 k] is the covariances' gradient."""
+    """Like `scatter`, but only the scales have a gradient.
+
+    `raw` [n, 7 k] is the gradient with respect to raw covariances.
+    """
     chunks = (anchors + SHARE - 1) // SHARE
     chunk = next_job(jobs, chunks)
     while chunk < chunks:

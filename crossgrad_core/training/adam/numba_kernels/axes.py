@@ -1,4 +1,4 @@
-"""Steps of positions, stretched along the axes of their Gaussians (Numba, CPU)."""
+"""Add position steps that are stretched along the axes of their Gaussians (Numba, CPU)."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +17,12 @@ from crossgrad_core.numerics.simd import (
     where,
 )
 
-#: Number of rows of one job. It is fixed, so that results do not depend on the number of threads.
+#: Number of rows in one job of the work queue. The number is fixed, so that results do not depend
+#: on the number of threads.
 _ROWS = 1 << 13
 _ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
-#: Squares below this value have too few significant bits.
+#: A quaternion with a smaller squared length counts as the identity, because the square has too few
+#: significant bits.
 _SMALLEST = np.float32(1e-30)
 
 _Floats = NDArray[np.float32]
@@ -30,7 +32,7 @@ _Four = tuple[Lanes, Lanes, Lanes, Lanes]
 
 @device
 def _stretched(steps: _Three, factors: _Three, quats: _Four) -> _Three:
-    """Rotate steps into the frames of the Gaussians, stretch them there, and rotate them back.
+    """Rotate steps into the axes of the Gaussians, stretch the steps, and rotate the steps back.
 
     A quaternion that is nearly zero counts as the identity.
     """
@@ -45,7 +47,7 @@ def _stretched(steps: _Three, factors: _Three, quats: _Four) -> _Three:
     r00, r01, r02 = one - (yy + zz), xy - wz, xz + wy
     r10, r11, r12 = xy + wz, one - (xx + zz), yz - wx
     r20, r21, r22 = xz - wy, yz + wx, one - (xx + yy)
-    # Do not change the order of these sums, because it determines the last bits and runs must be
+    # Do not change the order of these sums. The order determines the last bits, and runs must be
     # repeatable.
     p = factors[0] * fma(r20, c, fma(r10, b, r00 * a))
     q = factors[1] * fma(r21, c, fma(r01, a, r11 * b))
@@ -61,7 +63,7 @@ def _stretched(steps: _Three, factors: _Three, quats: _Four) -> _Three:
 def _move_chunks(
     jobs: Jobs, positions: _Floats, steps: _Floats, factors: _Floats, quats: _Floats
 ) -> None:
-    # Buffers for the last rows of a job, which do not fill a vector.
+    # Buffers for the last rows of a job, which do not fill a SIMD vector.
     position, step = np.zeros((LANES, 3), np.float32), np.zeros((LANES, 3), np.float32)
     factor, quat = np.zeros((LANES, 3), np.float32), np.zeros((LANES, 4), np.float32)
     rows = len(positions)
@@ -88,13 +90,13 @@ def _move_chunks(
 
 
 def move_rows(positions: _Floats, steps: _Floats, factors: _Floats, quats: _Floats) -> None:
-    """Add steps [N, 3] times factors [N, 3] along the axes of `quats` to positions [N, 3].
+    """Add steps [N, 3], scaled along the axes of the Gaussians, to positions [N, 3].
 
     Args:
         positions: Positions, changed in place.
-        steps: Steps in the frame of the positions.
-        factors: Factors by axis.
-        quats: [N, 4] rotations, wxyz of any length.
+        steps: Steps in world coordinates.
+        factors: [N, 3] factor of the step along each axis.
+        quats: [N, 4] rotations as quaternions (w, x, y, z) of any length.
     """
     run = serial if len(positions) <= _ROWS else parallel
     run(_move_chunks, positions, steps, factors, quats)

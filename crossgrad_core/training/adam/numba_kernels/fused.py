@@ -12,9 +12,11 @@ from crossgrad_core.numerics.jit import kernel
 from crossgrad_core.numerics.jobs import Jobs, next_job, parallel, serial
 from crossgrad_core.training.adam.coefficients import LARGEST, SMALLEST_NORMAL, TINY, Coefficients
 
-# In elements. The size is fixed, so that the split does not depend on the number of threads
+# Number of elements in one job. The number is fixed, so that results do not depend on the number of
+# threads.
 _CHUNK = 1 << 16
-_RUN = 1 << 13  # Number of elements that are skipped together if no step has moved them yet
+# Number of elements that are skipped together if their gradients and moments are all zero.
+_RUN = 1 << 13
 
 _ZERO = np.float32(0)
 _TINY, _SMALLEST_NORMAL, _LARGEST = (np.float32(v) for v in (TINY, SMALLEST_NORMAL, LARGEST))
@@ -30,11 +32,14 @@ Numbers: TypeAlias = tuple[
 def update(
     param: _Floats, grad: _Floats, exp_avg: _Floats, exp_avg_sq: _Floats, numbers: Numbers
 ) -> None:
-    """Apply one step in place to `param`, `exp_avg` and `exp_avg_sq`; all 1-D of equal length."""
+    """Apply one step in place to `param`, `exp_avg` and `exp_avg_sq`.
+
+    All arrays are 1-D and have equal length.
+    """
     beta1, new1, beta2, new2, step_size, root_scale, eps, square_floor, scale = numbers
     for i in range(len(param)):
         g = scale * grad[i]
-        g = min(max(g, -_LARGEST), _LARGEST)  # This order of the arguments preserves NaN.
+        g = min(max(g, -_LARGEST), _LARGEST)  # With this order of arguments, a NaN stays a NaN.
         g = _ZERO if abs(g) < _TINY else g
         m = beta1 * exp_avg[i] + new1 * g
         m = _ZERO if abs(m) < _TINY else m
@@ -48,7 +53,10 @@ def update(
 
 @kernel
 def moves(grad: _Floats, exp_avg: _Floats, exp_avg_sq: _Floats) -> bool:
-    """Return True if a gradient or moment is not 0; otherwise the step changes nothing."""
+    """Return True if any gradient or moment is not 0.
+
+    If all are 0, the Adam step changes nothing.
+    """
     few = min(64, len(grad))
     for end in (few, len(grad)):
         count = 0
@@ -67,14 +75,16 @@ def _update_chunks(
     numbers: _Floats,
     from_zero: NDArray[np.bool_],
 ) -> None:
-    """Update all tensors, chunk by chunk.
+    """Apply one step to all tensors; the work is split into chunks of elements.
 
     Args:
         jobs: Job counters, passed by `parallel`.
-        addresses: [T, 4] addresses of each tensor's values, gradient and moments.
-        sizes: [T] numbers of elements.
+        addresses: [T, 4] memory addresses of the values, the gradient and the two moments of each
+            tensor.
+        sizes: [T] number of elements of each tensor.
         numbers: [T, 9] coefficients of each tensor's step.
-        from_zero: [T], True if a tensor is uninitialised; zeros are then written to it first.
+        from_zero: [T], True if a tensor is uninitialised. Before the step, the kernel sets the
+            values of uninitialised tensors to zero.
     """
     chunks = 0
     for size in sizes:
@@ -102,8 +112,11 @@ def _update_chunks(
 
 
 def numbers_of(step: Coefficients) -> Numbers:
-    """Return the coefficients of a step as float32; learning rates beyond float32 are infinite."""
-    # Ignore the overflow here, because the check of the parameters reports its effect.
+    """Return the coefficients of a step as float32.
+
+    A learning rate beyond float32 becomes infinite.
+    """
+    # Ignore the overflow here, because the check of the parameters finds the infinite values.
     with np.errstate(over="ignore"):
         return (
             np.float32(step.beta1),
@@ -124,13 +137,13 @@ def update_at(
     """Apply a step to each of T tensors, in place.
 
     Args:
-        addresses: [T, 4] addresses of each tensor's values, gradient and both moments, float32,
-            contiguous.
-        sizes: [T] numbers of elements.
-        steps: [T] coefficients.
+        addresses: [T, 4] memory addresses of the values, the gradient and the two moments of each
+            tensor, which are float32 and contiguous.
+        sizes: [T] number of elements of each tensor.
+        steps: [T] coefficients of the step of each tensor.
     """
     numbers = np.array([numbers_of(step) for step in steps], np.float32).reshape(-1, 9)
-    # For one chunk of elements, starting other threads costs more than it saves.
+    # For a single chunk of elements, starting other threads takes longer than the update itself.
     run = serial if sum(sizes) <= _CHUNK else parallel
     where = np.array(addresses, np.int64).reshape(-1, 4)
     from_zero = np.array([step.from_zero for step in steps], np.bool_)

@@ -1,11 +1,12 @@
-"""Adam by rows: one step of rows with a gradient, or many steps of rows without a gradient.
+"""Adam by rows: one step for rows with a gradient, or many steps for rows without a gradient.
 
-The bits are the same as with `fused` on a whole tensor. With a gradient of zero, a step is
+The results are bit-identical to the results of `fused` for a whole tensor. With a gradient of zero,
+a step changes parameter p, first moment m and second moment v:
 
     m = beta1 m,   v = beta2 v,   p -= step_size * (m / (sqrt(v) * root_scale + eps))
 
-with the flushes to zero of `coefficients`. Eight elements therefore take any number of steps in
-registers, and memory is read and written only once.
+Small values of the moments m and v become 0, as described in `coefficients`. Eight elements take
+all their steps in registers, so that their memory is read and written only once.
 """
 
 import numpy as np
@@ -38,26 +39,29 @@ from crossgrad_core.training.adam.numba_kernels.fused import Numbers, moves, upd
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
 
-#: Columns of a table of steps: both betas, step size, scale of the root, eps, largest step size and
-#: smallest scale of the root. The last two columns are taken over this step and all later steps.
+#: Columns of a table of steps: both betas, step size, scale of the square root, eps, largest step
+#: size, smallest scale of the square root. The last two columns are the extreme values over the
+#: present step and all later steps.
 BETA1, BETA2, STEP_SIZE, ROOT_SCALE, EPS, MOST, LEAST = range(7)
 NUMBERS = 7
 
-#: Number of rows in one task, and number of short rows that are gathered into contiguous memory for
-#: a step.
+#: `_ROWS`: number of rows in one job. `_GATHERED`: number of short rows that are copied into
+#: contiguous memory for one call of `update`.
 _ROWS = 1024
 _GATHERED = 128
-#: Number of elements that a step with all rows gathers at a time, in whole cache lines (sixteen
-#: rows of any width). With parameters and moments, they fit into the first-level cache.
+#: Number of gradient elements that `update_all` gathers at a time. This number of elements fills
+#: complete cache lines for rows of any width. The gathered gradients fit into the first-level cache
+#: together with their parameters and moments.
 _AT_ONCE = 768
-#: Number of long rows that are updated together if they are consecutive.
+#: Largest number of consecutive long rows that are updated in one call.
 _SIDE_BY_SIDE = 16
-#: Number of elements in a cache line, and number of rows that are prefetched.
+#: `_LINE`: number of float32 elements in a cache line. `_AHEAD`: how many rows in advance a row is
+#: prefetched.
 _LINE, _AHEAD = 16, 6
-#: Number of steps between two checks of whether a parameter still changes.
+#: Number of steps between two checks whether the parameters still change.
 _LOOK = 32
-#: A step of less than half a unit in the last place (2^-25 or more) does not change a parameter.
-#: Half of this limit is reserved for the rounding of the estimate.
+#: A step below 2^-25 of a parameter (half a unit in the last place) does not change the parameter.
+#: The limit here is 2^-26, because the estimate itself has rounding errors.
 _STILL = np.float32(2.0**-26)
 # Second moments above this value stay normal numbers for `_LOOK` steps with beta2 >= 1/2.
 _STEADY = np.float32(2.0**-90)
@@ -68,9 +72,9 @@ _TINY, _SMALLEST_NORMAL, _LARGEST = (np.float32(v) for v in (TINY, SMALLEST_NORM
 
 @device
 def _rests(p: Lanes, m: Lanes, v: Lanes, steps: Floats, row: int) -> bool:
-    """Return True if the steps from `row` of the table on change no bit of the eight parameters.
+    """Return True if no step from `row` of the table on changes any of the eight parameters.
 
-    The ratio |m| / sqrt(v) of the moments decreases with every step while v is a normal number.
+    The function uses that |m| / sqrt(v) decreases with every step while v is a normal number.
     """
     zero = splat(_ZERO)
     root = where(splat(_STEADY) <= v, square_root(v), zero)
@@ -83,7 +87,7 @@ def _rests(p: Lanes, m: Lanes, v: Lanes, steps: Floats, row: int) -> bool:
 def _eight(
     p: Lanes, m: Lanes, v: Lanes, first: int, end: int, steps: Floats
 ) -> tuple[Lanes, Lanes, Lanes]:
-    """Apply the steps from `first` to before `end` of the table to eight elements."""
+    """Apply the steps `first` to `end - 1` of the table to eight elements."""
     zero, tiny, normal = splat(_ZERO), splat(_TINY), splat(_SMALLEST_NORMAL)
     k = end if bits(larger(magnitude(m), v) <= zero) == _ALL else first
     while k < end:
@@ -105,7 +109,7 @@ def _eight(
 
 @device
 def _bring_near(rows: Ints, k: int, width: int, p: Floats, m: Floats, v: Floats) -> None:
-    """Prefetch the memory of row k of the list, if there is one."""
+    """Prefetch the parameters and moments of the k-th listed row, if the list has so many rows."""
     if k >= rows.size:
         return
     at = np.intp(rows[k]) * width
@@ -129,24 +133,26 @@ def catch_up(
     before: int,
     steps: Floats,
 ) -> None:
-    """Apply the deferred steps without gradient to rows of a tensor.
+    """Apply deferred steps, which have no gradient, to rows of a tensor.
 
     Args:
         jobs: Job counters, passed by `parallel`.
         whole: True to update all rows.
-        rows: [R] the rows to update, without duplicates; unused if `whole`.
-        width: Elements of a row.
-        param: [N * width].
-        exp_avg: [N * width].
-        exp_avg_sq: [N * width].
+        rows: [R] the rows to update, without duplicates; unused if `whole` is True.
+        width: Number of elements in a row.
+        param: [N * width] values of the tensor.
+        exp_avg: [N * width] first moments.
+        exp_avg_sq: [N * width] second moments.
         done: [N] number of steps that each row has taken; updated.
-        before: Number of steps before the table; every row has taken these steps.
-        steps: [T * NUMBERS] the table of later steps.
+        before: Number of steps before the first step of the table. Every row has taken these
+            earlier steps.
+        steps: [T * NUMBERS] the table of steps.
     """
     count = done.size if whole else rows.size
     end = steps.size // NUMBERS
     left = width % LANES
-    # Buffer for the last elements of a row. The unused lanes are zero.
+    # Buffer for the last elements of a row, which do not fill a SIMD vector. The unused lanes stay
+    # zero.
     rest = np.zeros(3 * LANES, np.float32)
     tasks = (count + _ROWS - 1) // _ROWS
     task = next_job(jobs, tasks)
@@ -218,13 +224,14 @@ def _step_row(
     exp_avg_sq: Floats,
     numbers: Numbers,
 ) -> None:
-    """Apply one step to a row of WIDE elements or more.
+    """Apply one step to a row of at least `WIDE` elements.
 
-    The gradient of the row is row `grad_row` of `grad` if the row was rendered, else zero.
+    If the row was rendered, its gradient is row `grad_row` of `grad`; otherwise its gradient is
+    zero.
     """
     at, begin, g = row * width, grad_row * width, splat_wide(_ZERO)
-    # The last sixteen elements overlap with earlier elements. Compute the last sixteen elements
-    # before the earlier elements are overwritten.
+    # The row is processed in groups of sixteen elements. The last group may overlap with the group
+    # before. Compute the last group first, because its input must not have been updated already.
     tail = at + width - WIDE
     if drawn:
         g = load_wide(grad, begin + width - WIDE)
@@ -255,16 +262,17 @@ def update_rows(
     exp_avg_sq: Floats,
     numbers: Numbers,
 ) -> None:
-    """Apply one step to rows of a tensor with their gradients.
+    """Apply one step to the rows of a tensor that have a gradient.
 
     Args:
         jobs: Job counters, passed by `parallel`.
-        rows: [R], sorted and unique; consecutive rows are updated as one piece of memory.
-        width: Elements of a row.
-        param: [N * width].
-        grad: [R * width].
-        exp_avg: [N * width].
-        exp_avg_sq: [N * width].
+        rows: [R] row numbers, sorted and unique. Consecutive rows are updated as one piece of
+            memory.
+        width: Number of elements in a row.
+        param: [N * width] values of the tensor.
+        grad: [R * width] gradients of the listed rows.
+        exp_avg: [N * width] first moments.
+        exp_avg_sq: [N * width] second moments.
         numbers: The coefficients of the step, as in `fused`.
     """
     wide = width >= WIDE
@@ -313,16 +321,16 @@ def update_all(
     exp_avg_sq: Floats,
     numbers: Numbers,
 ) -> None:
-    """Apply one step to all rows of a tensor; rows that are not listed have no gradient.
+    """Apply one step to all rows of a tensor; rows that are not listed have a gradient of zero.
 
     Args:
         jobs: Job counters, passed by `parallel`.
-        rows: [R], sorted and unique.
-        width: Elements of a row.
-        param: [N * width].
-        grad: [R * width].
-        exp_avg: [N * width].
-        exp_avg_sq: [N * width].
+        rows: [R] indices of the rows with a gradient, sorted and unique.
+        width: Number of elements in a row.
+        param: [N * width] values of the tensor.
+        grad: [R * width] gradients of the listed rows.
+        exp_avg: [N * width] first moments.
+        exp_avg_sq: [N * width] second moments.
         numbers: The coefficients of the step, as in `fused`.
     """
     count, together = param.size // width, _LINE * max(1, _AT_ONCE // _LINE // width)

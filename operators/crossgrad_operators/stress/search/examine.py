@@ -1,4 +1,4 @@
-"""Examination of an operator's results on a batch."""
+"""Check the results of an operator on a batch of cases."""
 
 from dataclasses import replace
 from typing import Final
@@ -18,16 +18,17 @@ from crossgrad_operators.stress.verdict import ExactCase, Finding, by_law, facts
 
 Floats = NDArray[np.float64]
 
-#: Power of two by which gradients are scaled, to check that results scale equally.
+#: Factor for gradients, a power of two. If the gradients are multiplied by this factor, the results
+#: must be multiplied by this factor, too.
 _SCALE: Final = 2.0**20
-#: Relative change of gradients, to check that results change continuously.
+#: Relative change of gradients. Results must change only a little.
 _NUDGE: Final = 1e-12
-#: Number of cases with the largest changes that are tested for continuity in 50 digits.
+#: Number of cases with the largest changes for which continuity is tested with 50 digits.
 _CANDIDATES: Final = 16
 
 
 def examine(subject: Subject, batch: Batch) -> list[Finding]:
-    """Run an operator on a batch and judge every result."""
+    """Run an operator on a batch, and check every result."""
     with np.errstate(all="ignore"):
         outputs = results(subject.operator, batch)
         return [
@@ -45,22 +46,23 @@ def _judged(subject: Subject, exact: ExactCase, result: Tensor, apart: float | N
 
 
 def exact_case(batch: Batch, place: int) -> ExactCase:
-    """Return a case of a batch with its exact Gramian."""
+    """Return one case of a batch, together with its exact Gramian."""
     return ExactCase(short(batch.family, batch.rows[place], batch.dtype))
 
 
 def _from_laws(subject: Subject, batch: Batch, outputs: Floats) -> list[float] | list[None]:
-    """Return errors [B] for two laws: scaling with the gradients, and the order of two views.
+    """Return the errors [B] for two laws: scaling of the gradients, and exchange of two views.
 
-    The result is None for operators that have a reference.
+    For an operator with a reference, all errors are None.
     """
     if subject.reference.oracle is not None or subject.reference.rule is not None:
         return [None] * len(outputs)
     views = search_views(batch.views)
     scaled = results(subject.operator, replace(batch, rows=batch.rows * _SCALE), views) / _SCALE
     apart = np.linalg.norm(scaled - outputs, axis=1)
-    # Test the order only here. If a Gramian is nearly singular, the order may matter. The Gramians
-    # of random gradients are far from singular.
+    # The exchange of two views is tested only for random gradients. If a Gramian is nearly
+    # singular, the order of the views may matter. Gramians of random gradients are far from
+    # singular.
     if batch.family == USUAL and batch.views == 2:  # noqa: PLR2004
         turned = Views(views.labels[::-1], views.ratios[::-1], views.seed)
         other = results(subject.operator, replace(batch, rows=batch.rows[:, ::-1]), turned)
@@ -71,11 +73,13 @@ def _from_laws(subject: Subject, batch: Batch, outputs: Floats) -> list[float] |
 def largest_jump(
     subject: Subject, batch: Batch, rng: np.random.Generator
 ) -> tuple[int, float] | None:
-    """Return the case whose result changes most if gradients change by 1e-12, and the change.
+    """Return the case whose result changes most after a relative change of 1e-12 in its gradients.
 
-    The change is divided by the length of the longest gradient. Cases at which the method is not
-    continuous are skipped. None is returned if all cases with the largest changes are skipped.
-    Gradients are float64, in which such a small change is exact enough.
+    Also return the largest change.
+
+    The change is divided by the length of the longest gradient. Cases in which the operator is not
+    continuous are skipped. If all candidates are skipped, the function returns None. The gradients
+    are converted to float64, in which a change of 1e-12 is represented accurately.
     """
     wide = replace(batch, dtype=torch.float64)
     noise = _NUDGE * rng.standard_normal(batch.rows.shape)

@@ -1,4 +1,4 @@
-"""Batches of short gradients of the kinds for which small solvers often fail."""
+"""Generate batches of short gradients of kinds for which small solvers often fail."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -13,39 +13,42 @@ from crossgrad_operators.stress.reference import Views
 from crossgrad_operators.stress.runner import context_of
 
 Rows = NDArray[np.float64]
-#: Function (generator, B, K, P) -> [B, K, P] gradients.
+#: Function from (generator, B, K, P) to gradients [B, K, P].
 Family = Callable[[np.random.Generator, int, int, int], Rows]
-#: Maximum number of views, and maximum number of elements.
+#: Largest number of views, and largest number of elements.
 VIEWS, ELEMENTS = 20, 50
-#: Family of gradients for which the share outside a set is reported.
+#: Family of ordinary gradients. For this family, the share of cases outside the set is reported.
 USUAL: Final = "random"
-#: Numbers of views, and their probabilities. An exact answer takes 1 ms for two views and 1 s for
+#: Numbers of views K, and their probabilities. An exact result takes 1 ms for 2 views, and 1 s for
 #: 20 views.
 _VIEWS: Final = np.arange(2, VIEWS + 1)
 _SHARES: Final = _VIEWS**-2.0 / (_VIEWS**-2.0).sum()
-#: Number of cases in a batch with K views, multiplied by K^2.
+#: A batch with K views contains this number of cases, divided by K^2.
 _CASES: Final = 256
-#: The block in which each row is a separate gradient.
+#: A block in which each row of a tensor is a separate case.
 BLOCK = Block("means", ("means",), True, "geometry", LearningRate(1.0))
 
 
 def cases_of(views: int) -> int:
-    """Return the number of cases of a batch.
+    """Return the number of cases in a batch.
 
-    Cases with more views take longer, so a batch contains fewer of these cases.
+    Cases with many views take longer, so that a batch contains fewer cases with many views.
     """
     return max(1, _CASES // views**2)
 
 
 def rounded(rows: Rows, dtype: torch.dtype) -> Rows:
-    """Return the rows rounded to a type of gradients, as float64 numbers."""
+    """Return the rows after rounding to a gradient type, as float64 numbers."""
     # Add 0, so that no negative zeros remain.
     result: Rows = torch.from_numpy(rows).to(dtype).double().numpy() + 0.0
     return result
 
 
 def sizes(rng: np.random.Generator, family: str) -> tuple[int, int]:
-    """Draw K from 2 to 20, mostly small, and P from 1 to 50 for `USUAL`, else at most 2 K + 3."""
+    """Draw K from 2 to 20 (mostly small) and P.
+
+    P is at most 50 for the family `USUAL`, and else at most 2 K + 3.
+    """
     views = int(rng.choice(_VIEWS, p=_SHARES))
     elements = ELEMENTS if family == USUAL else 2 * views + 3
     return views, int(rng.integers(1, elements + 1))
@@ -61,19 +64,22 @@ def _powers(rng: np.random.Generator, shape: tuple[int, ...], low: float, high: 
 
 
 def usual(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
-    """Return normal random rows with norms over seven decades."""
+    """Return normally distributed rows whose norms vary over seven decades."""
     rows = _normal(rng, blocks, views, elements)
     return rows * _powers(rng, (blocks, views, 1), -3.5, 3.5)
 
 
 def integers(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
-    """Return small integers, which give exact ties and exactly singular Gramians."""
+    """Return small integers. Small integers cause exact ties and exactly singular Gramians."""
     bounds = rng.choice([1, 2, 9], (blocks, 1, 1))
     return np.rint(bounds * rng.uniform(-1, 1, (blocks, views, elements)))
 
 
 def low_rank(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
-    """Return rows of rank 1 to 3, half of them integers, for which rounding keeps the rank."""
+    """Return rows of rank 1 to 3.
+
+    Half of the rows are integers, whose rank rounding does not change.
+    """
     rank = int(rng.integers(1, 4))
     factors = _normal(rng, blocks, views, rank)
     basis = _normal(rng, blocks, rank, elements)
@@ -83,7 +89,10 @@ def low_rank(rng: np.random.Generator, blocks: int, views: int, elements: int) -
 
 
 def near_copies(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
-    """Return rows near (opposite) multiples of another row, at distances from 1 to 1e-16."""
+    """Return rows near multiples (also negative) of another row.
+
+    The distances vary from 1 to 1e-16.
+    """
     rows = _normal(rng, blocks, views, elements)
     source = rows[:, :1] * _apart(rng, blocks, elements)
     copied = rng.random((blocks, views, 1)) < rng.choice([0.3, 0.7, 1.0], (blocks, 1, 1))
@@ -95,9 +104,9 @@ def near_copies(rng: np.random.Generator, blocks: int, views: int, elements: int
 
 
 def _apart(rng: np.random.Generator, blocks: int, elements: int) -> Rows:
-    """Return masks [B, 1, P].
+    """Return masks [B, 1, P] that set some elements of a row to zero.
 
-    Small distances are exact at elements that these masks set to zero.
+    At these elements, small distances are represented exactly.
     """
     kept = rng.random((blocks, 1, elements)) < 0.6  # noqa: PLR2004
     kept[:, :, 0] = True
@@ -105,7 +114,7 @@ def _apart(rng: np.random.Generator, blocks: int, elements: int) -> Rows:
 
 
 def vanishing(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
-    """Return rows with a convex combination near zero, at distances from 1 to 1e-16."""
+    """Return rows with a convex combination near zero. The distances vary from 1 to 1e-16."""
     rows = _normal(rng, blocks, views, elements) * _apart(rng, blocks, elements)
     chosen = rng.random((blocks, views)) < rng.choice([0.3, 0.6, 1.0], (blocks, 1))
     chosen[:, 0] = True
@@ -118,19 +127,19 @@ def vanishing(rng: np.random.Generator, blocks: int, views: int, elements: int) 
 
 
 def ratios(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
-    """Return rows with norm ratios up to 1e12."""
+    """Return rows whose norms differ by factors of up to 1e12."""
     return _normal(rng, blocks, views, elements) * _powers(rng, (blocks, views, 1), -6, 6)
 
 
 def zeros(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
-    """Return rows with exact zeros: whole rows and single elements."""
+    """Return rows that contain exact zeros: complete rows and single elements."""
     rows = _normal(rng, blocks, views, elements)
     rows *= rng.random((blocks, views, 1)) < 0.7  # noqa: PLR2004
     return np.asarray(rows * (rng.random(rows.shape) < rng.uniform(0.2, 1, (blocks, 1, 1))))
 
 
 def mixed(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
-    """Return near copies or vanishing combinations with norm ratios up to 1e12."""
+    """Return near copies or vanishing combinations whose norms differ by factors of up to 1e12."""
     first = near_copies if rng.random() < 0.5 else vanishing  # noqa: PLR2004
     rows = first(rng, blocks, views, elements)
     return rows * _powers(rng, (blocks, views, 1), -6, 6)
@@ -153,9 +162,9 @@ class Batch:
     """B cases of equal size.
 
     Attributes:
-        rows: [B, K, P] gradients that are exact in their type.
+        rows: [B, K, P] gradients, exactly represented in their type.
         dtype: Type of the gradients.
-        family: Name of the family.
+        family: Name of the family of gradients.
     """
 
     rows: Rows
@@ -169,13 +178,19 @@ class Batch:
 
 
 def search_views(count: int, seed: int = 0) -> Views:
-    """Return alternating near and far views. Powers of their distances multiply without error."""
+    """Return views that are alternately near and far.
+
+    The distances of the views are powers of two, so that products of their powers are exact.
+    """
     labels = tuple(("near", "far")[k % 2] for k in range(count))
     return Views(labels, tuple(2.0 ** (k % 6 - 2) for k in range(count)), seed)
 
 
 def results(operator: Operator, batch: Batch, views: Views | None = None) -> Rows:
-    """Return the results [B, P] of an operator for each case, NaN for cases that raise an error."""
+    """Return the results [B, P] of an operator for each case.
+
+    A case that raises an error gives NaN.
+    """
     if isinstance(operator, GramianOperator):
         operator = operator.model_copy(update={"granularity": "gaussian"})
     return _results(operator, batch.rows, batch.dtype, views or search_views(batch.views))
@@ -190,7 +205,7 @@ def _results(operator: Operator, rows: Rows, dtype: torch.dtype, views: Views) -
     try:
         combined = operator.aggregate(context, EMPTY_STATE)[0].gradients[BLOCK.name]
     except Exception:
-        # Operators of other packages may raise any exception.
+        # An operator of another package may raise any exception.
         return _halved(operator, rows, dtype, views)
     if combined is None:
         return np.full(rows[:, 0].shape, np.nan)
@@ -199,9 +214,9 @@ def _results(operator: Operator, rows: Rows, dtype: torch.dtype, views: Views) -
 
 
 def _halved(operator: Operator, rows: Rows, dtype: torch.dtype, views: Views) -> Rows:
-    """Split the batch to find the cases that raise an error.
+    """Split the batch, to find the cases that raise an error.
 
-    The results of the remaining cases are kept.
+    The results of all other cases are returned as usual.
     """
     if len(rows) == 1:
         return np.full(rows[:, 0].shape, np.nan)

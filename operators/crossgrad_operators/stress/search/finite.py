@@ -1,4 +1,4 @@
-"""Check that results are finite, for a large number of short gradients."""
+"""Check that results are finite, for many short gradients."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,23 +15,23 @@ from crossgrad_operators.stress.search.families import FAMILIES, VIEWS, Batch, r
 from crossgrad_operators.stress.search.samples import Sample
 from crossgrad_operators.stress.suite import Subject
 
-#: Types of gradients that are tested.
+#: The types of gradients that are tested.
 BOTH: Final = (torch.float32, torch.float64)
-#: Number of cases in a batch, and greatest number of elements.
+#: Number of cases in a batch, and largest number of elements.
 BATCH, ELEMENTS = 1000, 20
 
 
 @dataclass(frozen=True, eq=False)
 class Finite:
-    """The findings for one operator.
+    """The results of the check for one operator.
 
     Attributes:
         operator: Name of the operator.
-        matrices: Number of cases that were run.
-        not_finite: Number of cases with a result that is not finite.
-        longest: Largest |u| divided by the longest gradient.
-        seconds: Duration.
-        example: A case whose result is not finite, or None.
+        matrices: Number of tested cases.
+        not_finite: Number of cases whose result is not finite.
+        longest: Largest length |u| of a result, divided by the length of the longest gradient.
+        seconds: Duration of the check in seconds.
+        example: A case whose result is not finite; None if all results are finite.
     """
 
     operator: str
@@ -46,7 +46,10 @@ class Finite:
 def run_finite(
     subject: Subject, matrices: int, seed: int = 0, dtypes: Sequence[torch.dtype] = BOTH
 ) -> Finite:
-    """Run an operator on `matrices` cases with K from 2 to 20, of alternating types."""
+    """Run an operator on `matrices` cases with K from 2 to 20.
+
+    The types of the gradients alternate.
+    """
     start = perf_counter()
     bad, longest, example = 0, 0.0, None
     for turn, first in enumerate(range(0, matrices, BATCH)):
@@ -64,8 +67,8 @@ def run_finite(
 
 def _batch(subject: Subject, dtype: torch.dtype, count: int, seed: tuple[int, int]) -> Batch:
     rng = np.random.default_rng(seed)
-    # Two successive batches belong to the same family. The gradients of the two batches have
-    # different types.
+    # Two successive batches belong to one family of gradients. The gradients of these two batches
+    # have different types.
     family = list(FAMILIES)[seed[1] // 2 % len(FAMILIES)]
     views = int(rng.integers(2, VIEWS + 1))
     if not subject.operator.views.admits(views):
@@ -75,14 +78,14 @@ def _batch(subject: Subject, dtype: torch.dtype, count: int, seed: tuple[int, in
 
 
 def _longest(batch: Batch, outputs: np.ndarray) -> float:
-    """Return the largest |u| divided by the longest gradient."""
+    """Return the largest length |u| of a result, divided by the length of the longest gradient."""
     length = np.linalg.norm(batch.rows, axis=2).max(axis=1)
     ratio = np.linalg.norm(outputs, axis=1) / np.where(length > 0, length, 1.0)
     return float(ratio.max(initial=0.0))
 
 
 def as_text(found: Sequence[Finite]) -> str:
-    """Return one line per operator, and the rows of an example that is not finite."""
+    """Return one line for each operator, and an example whose result is not finite."""
     head = f"{'operator':<16}{'matrices':>10}{'not finite':>12}{'longest |u|':>13}{'seconds':>9}"
     lines = [
         f"{result.operator:<16}{result.matrices:>10}{result.not_finite:>12}{result.longest:>13.3g}"
@@ -100,7 +103,7 @@ def as_text(found: Sequence[Finite]) -> str:
 
 
 def write_csv(found: Sequence[Finite], path: Path) -> None:
-    """Write one row per operator."""
+    """Write one row for each operator."""
     rows: list[dict[str, str | int | float]] = [
         {
             "operator": result.operator,

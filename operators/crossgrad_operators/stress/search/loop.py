@@ -1,4 +1,4 @@
-"""Rounds of the search: new gradients, then mutants of each operator's worst cases."""
+"""Search for the worst gradients in rounds: new gradients, then mutants of the worst cases."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -25,23 +25,24 @@ from crossgrad_operators.stress.search.samples import Sample, mutants
 from crossgrad_operators.stress.search.worst_cases import WorstCases, severity, specimen
 from crossgrad_operators.stress.suite import Subject
 
-#: Number of cases in a round that are changed slightly. These cases need no exact arithmetic.
+#: Number of cases in a round whose gradients are changed slightly. A case with a slight change
+#: needs no exact arithmetic.
 JUMPS = 64
-#: A reduced case must keep at least this share of the value.
+#: A simplified case must keep at least this share of the original value.
 KEPT = 0.7
-#: Numbers of significant digits to which elements are rounded.
+#: Numbers of significant digits to which elements are rounded in a simplified case.
 FEW_DIGITS = (1, 2, 4)
 
 
 @dataclass(frozen=True)
 class Extent:
-    """The start and the extent of a search.
+    """The start and the length of a search.
 
     Attributes:
         seed: Seed of all random numbers. A longer search begins with the cases of a shorter search.
-        seconds: No round begins after this time.
-        rounds: Greatest number of rounds, or None.
-        dtypes: Types of gradients, used in turn.
+        seconds: No new round begins after this time.
+        rounds: Largest number of rounds; None without a limit.
+        dtypes: Types of the gradients, used in turn.
     """
 
     seed: int = 0
@@ -55,7 +56,7 @@ def search(
     extent: Extent,
     progress: Callable[[int, Sequence[WorstCases]], None] = lambda _turn, _tallies: None,
 ) -> list[WorstCases]:
-    """Search for the worst gradients of every operator.
+    """Search for the worst gradients of each operator.
 
     Raises:
         UserError: mpmath is not installed.
@@ -79,14 +80,14 @@ def search(
 
 
 def _simplify(subject: Subject, tally: WorstCases) -> None:
-    """Remove unnecessary parts from the worst cases."""
+    """Simplify the worst cases."""
     for pool, inside in ((tally.inside_pool, True), (tally.outside_pool, False)):
         if pool and np.isfinite(pool[0].value):
             pool[0] = shrunk(subject, pool[0], inside=inside)
 
 
 def fresh(extent: Extent, turn: int) -> Batch:
-    """Return the gradients of a round."""
+    """Return the new gradients of a round."""
     type_index, cycle = turn % len(extent.dtypes), turn // len(extent.dtypes)
     rng = np.random.default_rng([extent.seed, turn])
     family = list(FAMILIES)[cycle % len(FAMILIES)]
@@ -99,7 +100,7 @@ def fresh(extent: Extent, turn: int) -> Batch:
 def _round(subject: Subject, tally: WorstCases, batch: Batch, at: tuple[int, int]) -> None:
     admitted = subject.operator.views
     if not admitted.admits(batch.views):
-        # If an operator takes only pairs, give it the first two views of each case.
+        # An operator that supports only two views receives the first two views of each case.
         batch = Batch(batch.rows[:, :2], batch.dtype, batch.family)
     if not admitted.admits(batch.views):
         return
@@ -119,19 +120,20 @@ def _round(subject: Subject, tally: WorstCases, batch: Batch, at: tuple[int, int
 
 
 def _over_steps(subject: Subject, tally: WorstCases, batch: Batch, turn: int) -> None:
-    """Run one case over several steps, for operators with memory."""
+    """Run one case over several steps, for operators that store values between steps."""
     finding, _ = judged(subject.operator, exact_case(batch, 0), subject.reference, search_views)
     if finding.verdict == "failed" and finding.reason != UNPROVEN:
         tally.fail(specimen(batch, 0, turn), f"over several steps: {finding.reason}")
 
 
 def shrunk(subject: Subject, specimen: Sample, *, inside: bool) -> Sample:
-    """Return the case without unnecessary rows, elements and digits.
+    """Return a case without unnecessary rows, elements and digits.
 
     Args:
-        subject: The operator.
-        specimen: A case with a large error inside the set, or with a long result outside the set.
-        inside: True for an error inside the set.
+        subject: The operator to test.
+        specimen: The case. The case has a large error inside the set, or a long result outside the
+            set.
+        inside: True if the value of the case is an error inside the set.
     """
     least = KEPT * specimen.value
     while True:
@@ -146,7 +148,7 @@ def shrunk(subject: Subject, specimen: Sample, *, inside: bool) -> Sample:
 
 
 def _smaller(subject: Subject, rows: Rows, dtype: torch.dtype) -> Iterator[Rows]:
-    """Yield cases with fewer rows or elements (half, a quarter, ... one), then fewer digits."""
+    """Yield cases with fewer rows or elements (by half, a quarter, ... one), then fewer digits."""
     for removed in _parts(len(rows), least=2):
         if subject.operator.views.admits(len(rows) - len(removed)):
             yield np.delete(rows, removed, axis=0)
@@ -159,7 +161,10 @@ def _smaller(subject: Subject, rows: Rows, dtype: torch.dtype) -> Iterator[Rows]
 
 
 def _parts(count: int, least: int) -> Iterator[range]:
-    """Yield removable index ranges, the longest first, so that at least `least` indices remain."""
+    """Yield ranges of indices that can be removed, the longest first.
+
+    At least `least` indices remain.
+    """
     size = count // 2
     while size:
         for first in range(0, count, size):

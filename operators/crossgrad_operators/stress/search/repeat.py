@@ -1,4 +1,4 @@
-"""Comparison of operators with 50 digits on a case given by the user."""
+"""Compare operators with 50-digit arithmetic on a case that the user specifies."""
 
 import json
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from crossgrad_operators.stress.verdict import ExactCase, Finding
 
 
 def read_rows(text: str, dtype: torch.dtype) -> Case:
-    """Return the case in a text such as [[1,2],[3,4]], with one row per view.
+    """Return the case that a text describes, such as [[1,2],[3,4]]. Each row belongs to one view.
 
     Raises:
         UserError: The text is not a matrix of finite numbers.
@@ -30,13 +30,14 @@ def read_rows(text: str, dtype: torch.dtype) -> Case:
     with np.errstate(over="ignore"):
         case = short(str(dtype).removeprefix("torch."), rows, dtype)
         finite = np.isfinite(case.exact_head).all()
-    if not finite:  # The test comes after rounding to the type.
+    # The values are tested after rounding to the type, because rounding may overflow.
+    if not finite:
         raise _no_matrix(text)
     return case
 
 
 def run_rows(subjects: Sequence[Subject], case: Case) -> list[Cell]:
-    """Run every operator on one case, as the search does."""
+    """Run all operators on one case, as in the search."""
     mpmath = require_mpmath()
     with mpmath.mp.workdps(DIGITS):
         exact = ExactCase(case)

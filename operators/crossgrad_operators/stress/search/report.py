@@ -1,4 +1,4 @@
-"""The report of a search, as text."""
+"""Report the results of a search as text."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -7,7 +7,8 @@ from crossgrad_core.commands import write_table
 from crossgrad_operators.stress.search.samples import Sample
 from crossgrad_operators.stress.search.worst_cases import WorstCases
 
-#: Maximum share of random gradients outside a set, and minimum number of gradients for this check.
+#: Largest allowed share of ordinary gradients outside the set, and smallest number of gradients for
+#: this check.
 SHARE, ENOUGH = 0.01, 2000
 
 #: Counts that are columns of the CSV file.
@@ -26,17 +27,20 @@ _HEAD = (
     f"{'|u|':>10}{'jump':>10}{'infinite':>9}{'unproven':>9}{'broken':>8}"
 )
 LEGEND = (
-    "outside: share outside the operator's set (docs/operators.md); usual: the same of gradients\n"
-    "  with K 2 to 20 (mostly few), P 1 to 50, norms over seven decades; 1 % of these is allowed.\n"
-    "error: the worst inside the set, in units of u kappa; |u|: the longest outside it, over the\n"
-    "  longest gradient; jump: how far a result moves, over the longest gradient, where gradients\n"
-    "  move by 1e-12 of themselves and the method is continuous.\n"
-    "infinite: results that are not finite; unproven: cases without a proven 50-digit answer."
+    "outside: share of the matrices that are outside the operator's set (docs/operators.md).\n"
+    "usual: share of the ordinary matrices that are outside the set. At most 1 % is allowed.\n"
+    "  Ordinary matrices have K = 2 to 20, P = 1 to 50, and norms over seven decades.\n"
+    "error: largest error inside the set, in units of u kappa.\n"
+    "|u|: longest result outside the set, divided by the longest gradient.\n"
+    "jump: largest change of a result, divided by the length of the longest gradient, after all\n"
+    "  gradient elements change by a factor near 1 + 1e-12, where the method is continuous.\n"
+    "infinite: results that are not finite.\n"
+    "unproven: matrices for which no 50-digit reference was proven."
 )
 
 
 def as_text(tallies: Sequence[WorstCases]) -> str:
-    """Return the table, the worst cases of each operator, and the broken promises."""
+    """Return the table, the worst cases of each operator, and the broken guarantees."""
     used = [tally for tally in tallies if tally.matrices]
     worst = [line for tally in used for line in _worst(tally)]
     parts = ["\n".join([_HEAD, *map(_line, used)]), LEGEND, "\n".join(["worst cases:", *worst])]
@@ -44,7 +48,7 @@ def as_text(tallies: Sequence[WorstCases]) -> str:
 
 
 def write_csv(tallies: Sequence[WorstCases], path: Path) -> None:
-    """Write one row per operator and type."""
+    """Write one row for each operator and type."""
     write_table(path, [_row(tally) for tally in tallies])
 
 
@@ -60,7 +64,7 @@ def _row(tally: WorstCases) -> dict[str, str | int | float]:
 
 
 def failed(tally: WorstCases) -> bool:
-    """Return True if a promise was broken."""
+    """Return True if a guarantee was broken."""
     return tally.broken > 0 or _too_often_outside(tally)
 
 
@@ -108,5 +112,5 @@ def _failures(tallies: Sequence[WorstCases]) -> str:
         if _too_often_outside(tally)
     ]
     if not lines:
-        return "nothing outside what is stated"
-    return "\n".join(["broken promises:", *lines])
+        return "no broken guarantee"
+    return "\n".join(["broken guarantees:", *lines])

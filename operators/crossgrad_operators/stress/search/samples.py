@@ -1,4 +1,4 @@
-"""Single cases that are stored, and their mutations."""
+"""Stored test cases, and mutations of stored cases."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -19,14 +19,14 @@ from crossgrad_operators.stress.search.families import (
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """A case and its value, which states how bad the case is.
+    """A case with a value that measures how bad the case is.
 
     Attributes:
-        rows: [K, P] gradients that are exact in their type.
+        rows: [K, P] gradients, exactly represented in their type.
         dtype: Type of the gradients.
-        family: Name of the family.
-        turn: The round in which the case was found.
-        value: An error or a ratio.
+        family: Name of the family of gradients.
+        turn: Number of the round in which the case was found.
+        value: An error, or the length of a result relative to the longest gradient.
     """
 
     rows: Rows
@@ -37,11 +37,11 @@ class Sample:
 
     @property
     def precision(self) -> str:
-        """The name of the type."""
+        """The name of the gradients' type."""
         return str(self.dtype).removeprefix("torch.")
 
     def text(self) -> str:
-        """Return the rows as text that can be read back exactly."""
+        """Return the rows as text, with enough digits to read the rows again exactly."""
         number = np.float32 if self.dtype == torch.float32 else np.float64
         rows = [[_shortest(number(value)) for value in row] for row in self.rows]
         return "[" + ",".join("[" + ",".join(row) + "]" for row in rows) + "]"
@@ -53,15 +53,18 @@ def _shortest(value: np.floating) -> str:
     return min(text, plain, key=len) if float(plain) == float(text) else text
 
 
-#: Suffix of the family names of mutants.
+#: Suffix of the names of families that contain mutants.
 MUTATED = ", mutated"
 
-#: Function (generator, [B, K, P]) -> [B, K, P].
+#: Function from (generator, gradients [B, K, P]) to changed gradients [B, K, P].
 Mutation = Callable[[np.random.Generator, Rows], Rows]
 
 
 def mutants(rng: np.random.Generator, parents: Sequence[Sample], admitted: ViewCounts) -> Batch:
-    """Return variants of the parents, some of them with one row or element more or less."""
+    """Return a batch of variants of one of the parents.
+
+    Sometimes, the variants have one row or element more or less.
+    """
     parent = parents[int(rng.integers(len(parents)))]
     rows = parent.rows
     if rng.random() < 0.2:  # noqa: PLR2004
@@ -69,7 +72,8 @@ def mutants(rng: np.random.Generator, parents: Sequence[Sample], admitted: ViewC
         rows = reshaped if admitted.admits(len(reshaped)) else rows
     batch = np.repeat(rows[None], cases_of(len(rows)), axis=0)
     pieces = np.array_split(batch, len(MUTATIONS))
-    # Use a random order, because the last pieces of a small batch are empty.
+    # The order of the mutations is random, because a small batch has fewer cases than there are
+    # mutations.
     order = rng.permutation(len(MUTATIONS)).tolist()
     variants = [
         MUTATIONS[mutation](rng, piece) for mutation, piece in zip(order, pieces, strict=True)
@@ -79,20 +83,20 @@ def mutants(rng: np.random.Generator, parents: Sequence[Sample], admitted: ViewC
 
 
 def _nudge_elements(rng: np.random.Generator, rows: Rows) -> Rows:
-    """Change some elements by a relative amount from 1 to 1e-16."""
+    """Change some elements by relative amounts between 1 and 1e-16."""
     amount = 10.0 ** rng.uniform(-16, 0, (len(rows), 1, 1))
     chosen = rng.random(rows.shape) < rng.uniform(0, 1, (len(rows), 1, 1)) ** 2
     return np.asarray(rows * (1 + chosen * amount * rng.standard_normal(rows.shape)))
 
 
 def _scale_rows(rng: np.random.Generator, rows: Rows) -> Rows:
-    """Multiply some rows by factors up to 1e6."""
+    """Multiply some rows by factors between 1e-6 and 1e6."""
     chosen = rng.random((*rows.shape[:2], 1)) < 0.3  # noqa: PLR2004
     return np.asarray(rows * np.where(chosen, 10.0 ** rng.uniform(-6, 6, chosen.shape), 1.0))
 
 
 def _approach(rng: np.random.Generator, rows: Rows) -> Rows:
-    """Replace a row by plus or minus another row plus a share of itself."""
+    """Replace a row by plus or minus another row, plus a small share of the old row."""
     blocks, views, _ = rows.shape
     one, other = rng.integers(views, size=(2, blocks))
     every_block = np.arange(blocks)
@@ -104,7 +108,7 @@ def _approach(rng: np.random.Generator, rows: Rows) -> Rows:
 
 
 def _replace_elements(rng: np.random.Generator, rows: Rows) -> Rows:
-    """Replace some elements by zero or normal random numbers."""
+    """Replace some elements by zeros or by normally distributed numbers."""
     chosen = rng.random(rows.shape) < rng.uniform(0, 0.3, (len(rows), 1, 1))
     size = np.abs(rows).max(axis=2, keepdims=True)
     fresh = size * rng.standard_normal(rows.shape) * (rng.random(rows.shape) < 0.5)  # noqa: PLR2004
@@ -118,7 +122,7 @@ def _turn_rows(rng: np.random.Generator, rows: Rows) -> Rows:
     return np.asarray(np.take_along_axis(rows * signs, order[:, :, None], axis=1))
 
 
-#: Function (generator, [K, P]) -> gradients with one row or one column more or fewer.
+#: Function from (generator, gradients [K, P]) to gradients with one row or one column more or less.
 Reshaping = Callable[[np.random.Generator, Rows], Rows]
 
 

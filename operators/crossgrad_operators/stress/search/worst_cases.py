@@ -1,4 +1,4 @@
-"""Findings of a search for one operator and one type of gradients."""
+"""The results of a search for one operator and one type of gradients."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -11,35 +11,38 @@ from crossgrad_operators.stress.search.families import USUAL, Batch
 from crossgrad_operators.stress.search.samples import Sample
 from crossgrad_operators.stress.verdict import NOT_FINITE, Finding
 
-#: Number of stored cases of each kind. Mutants are made from them.
+#: Number of worst cases that are stored inside and outside the set. Mutants are made from the
+#: stored cases.
 POOL = 8
-#: Maximum number of views of the cases from which mutants are made. Exact answers take long for
-#: more views.
+#: Largest number of views of cases from which mutants are made. With more views, exact results
+#: would take too long.
 MUTATED_VIEWS = 8
-#: Maximum change of a continuous method's result, as a share of the longest gradient.
+#: Largest allowed change of a result, relative to the longest gradient, where the operator is
+#: continuous.
 JUMP = 1e-3
-#: Number of cases with a broken guarantee that are stored for the report.
+#: Number of stored cases that break a guarantee, for the report.
 KEPT = 5
 
 
 @dataclass
 class WorstCases:
-    """Counts and worst cases of one operator, updated with every batch.
+    """Counts and worst cases of one operator. Every batch updates these counts and cases.
 
     Attributes:
         operator: Name of the operator.
         dtype: Type of the gradients.
-        matrices: Number of cases that were run.
+        matrices: Number of tested cases.
         outside: Number of cases outside the operator's set.
-        usual: Number of cases of the usual family.
-        ordinary_outside: Number of usual cases outside the set.
-        unproven: Number of cases without a proven reference.
-        not_finite: Number of cases with a result that is not finite.
-        broken: Number of cases that break a promise.
-        inside_pool: Cases with the largest error inside the set, the worst first.
-        outside_pool: Cases with the largest |u| outside the set, divided by the longest gradient.
-        jump: The case whose result changes most although the method is continuous.
-        failures: Some of the cases that break a promise, with the reason.
+        usual: Number of cases of the family `USUAL`.
+        ordinary_outside: Number of cases of the family `USUAL` outside the set.
+        unproven: Number of cases for which the oracle could not prove its result.
+        not_finite: Number of cases whose result is not finite.
+        broken: Number of cases that break a guarantee.
+        inside_pool: The cases with the largest errors inside the set, in descending order.
+        outside_pool: The cases with the longest results outside the set, relative to the longest
+            gradient.
+        jump: The case whose result changes most although the operator is continuous.
+        failures: Some of the cases that break a guarantee, with the reasons.
     """
 
     operator: str
@@ -58,7 +61,7 @@ class WorstCases:
 
     @property
     def pool(self) -> list[Sample]:
-        """The cases from which mutants are made."""
+        """The stored cases from which mutants are made."""
         worst = [*self.inside_pool, *self.outside_pool]
         return [sample for sample in worst if len(sample.rows) <= MUTATED_VIEWS]
 
@@ -69,11 +72,11 @@ class WorstCases:
 
     @property
     def ordinary_share(self) -> float:
-        """The share of usual cases outside the set."""
+        """Share of the cases of the family `USUAL` that are outside the set."""
         return self.ordinary_outside / max(self.usual, 1)
 
     def add(self, batch: Batch, findings: Sequence[Finding], turn: int) -> None:
-        """Count a batch and store its worst cases."""
+        """Count the cases of a batch, and store its worst cases."""
         outside = sum(finding.is_outside for finding in findings)
         self.matrices += len(findings)
         self.outside += outside
@@ -91,28 +94,30 @@ class WorstCases:
                 self.fail(specimen(batch, index, turn), finding.reason)
 
     def fail(self, sample: Sample, reason: str) -> None:
-        """Count a case that breaks a promise. The first such cases are stored for the report."""
+        """Count a case that breaks a guarantee.
+
+        The first few failed cases are stored for the report.
+        """
         self.broken += 1
         if len(self.failures) < KEPT:
             self.failures.append((sample, reason))
 
     def jumped(self, found: Sample) -> None:
-        """Count a result that changes too much, and store the largest change."""
+        """Count a case whose result changes too much. Store the case with the largest change."""
         if self.jump is None or found.value > self.jump.value:
             self.jump = found
         if found.value > JUMP:
             self.broken += 1
             moved = f"the result moves by {found.value:.3g} of the longest gradient"
-            # Insert the case at the front, because other failures are numerous and would fill the
-            # list.
+            # Insert this case at the front, because many other failures could fill the list.
             jump = (found, f"{moved} if the gradients move by 1e-12")
             self.failures = [jump, *self.failures][:KEPT]
 
 
 def severity(finding: Finding, *, inside: bool) -> float:
-    """Return the error inside the set, or |u| / longest gradient outside.
+    """Return the error inside the set, or the length |u| / (longest gradient) outside the set.
 
-    Return 0 if neither is known.
+    Return 0 if the requested value is not known.
     """
     if not inside:
         return finding.ratio if finding.is_outside else 0.0
@@ -122,12 +127,12 @@ def severity(finding: Finding, *, inside: bool) -> float:
 
 
 def specimen(batch: Batch, place: int, turn: int, value: float = 0.0) -> Sample:
-    """Return a case of a batch as a sample."""
+    """Return one case of a batch as a `Sample`."""
     return Sample(batch.rows[place].copy(), batch.dtype, batch.family, turn, value)
 
 
 def _worst(pool: list[Sample], batch: Batch, values: Sequence[float], turn: int) -> list[Sample]:
-    """Return the worst cases of a pool and a batch together."""
+    """Return the worst cases among the cases of a pool and of a batch."""
     last = pool[-1].value if len(pool) == POOL else 0.0
     ranked = sorted(range(len(values)), key=lambda index: -values[index])
     worst = [index for index in ranked[:2] if values[index] > last]

@@ -1,1 +1,1 @@
-"""Training of a package's components with all others, as a command and as a pytest plugin."""
+"""Train a package's components with all other components: a command and a pytest plugin."""

@@ -1,8 +1,8 @@
-"""Combinations of components: few rows that contain every pair, and the run of one row.
+"""Combinations of components: few combinations that contain every pair, and one short run each.
 
-Every combination contains components of five slots. The components of further slots (losses,
-exposures, initializers, resolutions, groupings, observers) are added to such combinations one at a
-time.
+Every combination contains one component of each of five slots (`SLOTS`). The components of the
+other slots (`FURTHER`: losses, exposures, initializers, resolutions, groupings, observers) are
+added one at a time.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -24,25 +24,27 @@ from crossgrad_core.plugin import Backbone, Operator, Rasterizer, Sampler
 
 SLOTS: Final = ("sampler", "operator", "backbone", "densifier", "rasterizer")
 FURTHER: Final = ("loss", "exposure", "initializer", "resolution", "grouping", "observer")
-#: Options that make a component have an effect within these few steps.
+#: Options with which a component has an effect within these few steps.
 NEEDED: Final[Mapping[tuple[str, str], Mapping[str, Any]]] = {
     ("operator", "chain"): {"links": [{"name": "symmetric"}, {"name": "mean"}]},
-    # With this option, anchors are judged at the first edit. Small cells leave free cells nearby.
+    # With threshold 0, every anchor is judged at the first edit. With a small `voxel_size`, there
+    # are free cells near the anchors.
     ("backbone", "scaffold"): {"voxel_size": 1e-5},
     ("densifier", "anchor"): {"success_threshold": 0, "coarsest": 1},
     ("densifier", "octree"): {"success_threshold": 0},
-    # In this small scene, each Gaussian is blended in only a few pixels.
+    # Each Gaussian is blended in only a few pixels of this small scene, so the threshold must be 0.
     ("densifier", "multiview"): {"importance": 0},
     ("densifier", "multiview-gate"): {"importance": 0},
 }
-#: Number of steps in a run of the matrix. Density control edits in steps 2 and 4, and opacities are
-#: reset in step 4.
+#: Number of steps in a run of the matrix. Density control edits the primitives in steps 2 and 4,
+#: and resets opacities in step 4.
 STEPS: Final = 5
 _WINDOW: Final = {"densify_from": 1, "densify_every": 2, "densify_until": 100}
 _TIMES: Final = {"schedule_unit": "steps", "reset_every": 4, **_WINDOW}
-#: A row contains one value for each factor.
+#: One combination: the names of its components, in the order of the slots.
 Row: TypeAlias = tuple[str, ...]
-#: Row -> reasons why it was refused. Rows that work are not in the mapping.
+#: Combination -> reasons why it was refused. Combinations that can be trained are not keys of this
+#: mapping.
 Refused: TypeAlias = Mapping[Row, Collection[str]]
 
 
@@ -51,7 +53,7 @@ class Factors:
     """Combinations of the components of some slots.
 
     Attributes:
-        slots: The slots, in the order of the names in a row.
+        slots: The slots, in the order of the names in a combination.
         rows: The combinations.
     """
 
@@ -112,7 +114,10 @@ def config_of(row: Row, slots: Sequence[str] = SLOTS) -> RunConfig:
 
 @cache
 def _several_views(sampler: ComponentChoice, operator: ComponentChoice) -> int | None:
-    """Return the smallest K above 1 that both admit, so that operators have an effect."""
+    """Return the smallest K above 1 that sampler and operator allow.
+
+    With K above 1, operators have an effect.
+    """
     counts = (
         build(Sampler, sampler.name, sampler.options).view_counts,
         build(Operator, operator.name, operator.options).views,
@@ -129,7 +134,8 @@ def named(row: Row, slots: Sequence[str] = SLOTS) -> str:
 def as_lines(refusals: Refused, rows: Sequence[Row], slots: Sequence[str] = SLOTS) -> list[str]:
     """Format the refusals among `rows` as sorted lines `slot=name slot=name: reason`.
 
-    A line covers all rows with these names. Together, the lines cover exactly the refusals.
+    A line stands for all combinations that contain its names. Together, the lines describe all
+    refused combinations and no other combination.
     """
     by_reason: dict[str, set[Row]] = {}
     for row, reasons in refusals.items():
@@ -145,7 +151,7 @@ def as_lines(refusals: Refused, rows: Sequence[Row], slots: Sequence[str] = SLOT
 
 
 def _slots_that_decide(concerned: set[Row], rows: Sequence[Row]) -> tuple[int, ...]:
-    """Return the fewest slots whose names separate the given rows from all other rows."""
+    """Return the fewest slots whose names separate the given combinations from all others."""
     everything = range(len(rows[0]))
     for count in everything:
         for places in combinations(everything, count):
@@ -162,18 +168,18 @@ def meetings(
     usual: Callable[[Mapping[int, str]], Row],
     admits: Callable[[Row], bool],
 ) -> Iterator[Row]:
-    """Yield few admitted rows in which one value meets every value of the other factors.
+    """Yield few allowed combinations of one value with every value of the other factors.
 
-    First, the values of all factors are combined in turn. A value without an admitted row so far is
-    then tried with the default values of the other factors; one factor at a time is changed. Not
-    every row is tried, because many factors have too many rows.
+    First, the n-th values of all other factors are combined. A value that is not yet in an allowed
+    combination is then tried with the default values of the other factors; one of these defaults is
+    changed at a time. Not every combination is tried, because there can be too many.
 
     Args:
-        place: Factor of the value.
-        value: The value.
+        place: Index of the factor that the value belongs to.
+        value: The value that all combinations contain.
         values: The values of each factor.
-        usual: Completes a row in which some values are given.
-        admits: Function that returns True if the components of a row can be combined.
+        usual: Function that completes a combination in which only some values are given.
+        admits: Function that returns True if the components of a combination work together.
     """
     missing = {(i, name) for i, names in enumerate(values) if i != place for name in names}
     for turn in range(max(map(len, values))):

@@ -16,7 +16,7 @@ from crossgrad_plugins.authoring.matrix.combinations import (
     meetings,
 )
 
-#: Return True if a combination of these slots can work.
+#: Function that returns True if a combination of components can be trained.
 Admits = Callable[[Row, tuple[str, ...]], bool]
 
 
@@ -27,7 +27,7 @@ class Members:
     Attributes:
         package: Name and version of the package.
         names: Slot -> the names of all installed components that can be combined.
-        own: (slot, name) of the components of the package.
+        own: (slot, name) of each component that belongs to the package.
         left_out: Components of other packages that cannot be combined, with the reason.
     """
 
@@ -78,7 +78,7 @@ def members_of(package: str) -> Members:
 
 
 def _cannot_be_combined(entry: Entry) -> str:
-    """Return the reason why a component is left out; empty if it is not left out."""
+    """Return the reason why a component cannot be combined, or an empty text."""
     if [offer.name for offer in offers(entry.slot)].count(entry.name) > 1:
         return "two packages offer this name"
     try:
@@ -98,14 +98,14 @@ def _runs_here(rasterizer: type[Rasterizer]) -> bool:
 
 
 def combinations_of(members: Members, admits: Admits, *, full: bool) -> Iterator[Factors]:
-    """Yield the combinations to train: first of the five slots, then of each further slot.
+    """Yield the combinations to train: first of the five slots, then with each further slot.
 
     Args:
         members: The components that are combined.
-        admits: Called with every requested combination; returns True if the combination can work.
-        full: True for all combinations with a component of the package. False for the fewest
-            combinations in which every component of the package occurs with every component of
-            other slots that it can work with.
+        admits: Function that returns True if a requested combination can be trained.
+        full: True for all combinations that contain a component of the package. False for the
+            fewest combinations in which each component of the package occurs with every compatible
+            component of the other slots.
     """
     ours = sorted((SLOTS.index(slot), name) for slot, name in members.own if slot in SLOTS)
     if ours:
@@ -130,7 +130,7 @@ def _few_of(
 ) -> Iterator[Row]:
     """Yield few combinations.
 
-    Each component of the package occurs with every component that it works with.
+    Each component of the package occurs with every compatible component.
     """
     values = [members.names[slot] for slot in slots[: len(SLOTS)]]
     values += [(name,) for _, name in ours[: len(slots) - len(SLOTS)]]

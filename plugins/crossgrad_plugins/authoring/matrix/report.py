@@ -29,8 +29,8 @@ class Tally:
 
     Attributes:
         members: The components that are combined.
-        trained: (slot, name) of each component that was trained, by combination.
-        refused: Slots -> combination with a component of the package -> reasons.
+        trained: Combination -> (slot, name) of each component in it.
+        refused: Slots -> combination that contains a component of the package -> reasons.
         failed: Combination as text -> reason of its failure.
     """
 
@@ -40,9 +40,9 @@ class Tally:
     failed: dict[str, str] = field(default_factory=dict)
 
     def admits(self, row: Row, slots: tuple[str, ...]) -> bool:
-        """Return True if a run of the combination can start; record the reasons if it cannot.
+        """Return True if a run of the combination can start; otherwise, record the reasons.
 
-        An error other than a refusal occurs again in training, where it is recorded.
+        An unexpected error is not recorded here, because training raises and records it again.
         """
         try:
             reasons = reasons_to_refuse(config_of(row, slots))
@@ -80,13 +80,13 @@ def train_matrix(package: str, *, full: bool) -> tuple[str, bool]:
 
     Args:
         package: Name of a distribution, or of an import package that holds plugins.
-        full: True for all combinations instead of a pairwise design.
+        full: True for all combinations; False for few combinations that contain every pair.
 
     Returns:
-        The report in 80 columns, and whether no combination failed.
+        The report in 80 columns, and True if no combination failed.
 
     Raises:
-        UserError: For the reasons of `members_of`.
+        UserError: The same conditions as in `members_of`.
     """
     tally = Tally(members_of(package))
     progress = Progress(_PAUSE)
@@ -108,7 +108,7 @@ def train_one(package: str, combination: str) -> None:
 
     Args:
         package: Name of the package.
-        combination: `slot=name slot=name`, as the report shows it.
+        combination: The text `slot=name slot=name` that the report shows.
 
     Raises:
         UserError: The format is invalid, or a component is not installed.
@@ -151,7 +151,7 @@ def report(tally: Tally, package: str) -> str:
 
 
 def _refusals(rows: Refused, slots: tuple[str, ...], tally: Tally) -> list[str]:
-    """Return the refusals in few lines that contain no trained combination."""
+    """Summarise the refused combinations in few lines that match no trained combination."""
     wanted = set(slots)
     trained = [pairs for pairs in tally.trained if {slot for slot, _ in pairs} == wanted]
     names = [dict(pairs) for pairs in trained]

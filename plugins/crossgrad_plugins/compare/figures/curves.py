@@ -1,4 +1,4 @@
-"""Figures with a panel for each scene: curves, frontier, regimes, performance profile."""
+"""Figures with one panel for each scene: curves, frontier, regimes, performance profile."""
 
 from typing import TYPE_CHECKING, Final
 
@@ -14,18 +14,18 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-#: The axis begins at this quantile of the values, so that the first, much lower evaluations are cut
-#: off.
+#: The vertical axis starts at this quantile of the values, because the first evaluations are much
+#: lower.
 _KEPT: Final = 0.22
 _COUNT: Final = Quantity("primitives", "primitives", "", 0, 0.0)
-#: Width of the range over which the markers of all arms are spread, relative to the distance
-#: between two groups.
+#: Width over which the markers of all arms are spread, relative to the distance of two groups on
+#: the axis.
 _SPREAD: Final = 0.62
 _POINTS = 301
 
 
 def draw_curves(c: Comparison, cost: Cost) -> Drawn:
-    """Draw the main metric of all arms over one cost."""
+    """Draw the main metric of all arms against one cost."""
 
     def panel(ax: "Axes", scene: str) -> None:
         limits = draw_bands(ax, c, scene, c.quantity, cost)
@@ -45,7 +45,7 @@ def draw_curves(c: Comparison, cost: Cost) -> Drawn:
 
 
 def draw_primitives(c: Comparison, cost: Cost) -> Drawn:
-    """Draw the number of primitives of all arms over one cost, in thousands."""
+    """Draw the number of primitives of all arms, in thousands, against one cost."""
 
     def panel(ax: "Axes", scene: str) -> None:
         draw_bands(ax, c, scene, _COUNT, cost, 1e3)
@@ -62,7 +62,10 @@ def draw_primitives(c: Comparison, cost: Cost) -> Drawn:
 
 
 def draw_frontier(c: Comparison, cost: Cost) -> Drawn | None:
-    """Draw final quality over the cost of whole runs; return None if all runs have one length."""
+    """Draw final quality against the cost of whole runs.
+
+    Return None if all runs have one length.
+    """
     if not c.cells.several:
         return None
     look = looks([arm.name for arm in c.arms])
@@ -86,7 +89,7 @@ def draw_frontier(c: Comparison, cost: Cost) -> Drawn | None:
                 label=literal(arm),
             )
         ax.set_xscale("log")
-        # Show plain numbers such as 300 and 600 instead of powers of ten.
+        # Show plain numbers such as 300 and 600, because powers of ten are harder to read.
         ax.xaxis.set_major_locator(LogLocator(base=10.0, subs=(1.0, 2.0, 5.0)))
         ax.xaxis.set_major_formatter("{x:,g}")
         ax.xaxis.set_minor_locator(NullLocator())
@@ -138,7 +141,7 @@ def draw_regimes(c: Comparison) -> Drawn:
 
 
 def draw_profile(c: Comparison) -> Drawn | None:
-    """Draw a panel for each cost; return None for a single arm or if arms share no problem."""
+    """Draw one panel for each cost; return None for a single arm or without common problems."""
     by_cost = {cost: ratios([row for row in c.reached if row.cost == cost]) for cost in c.costs}
     shown = {cost.title: by for cost, by in by_cost.items() if any(by.values())}
     if len(c.arms) < 2 or not shown:  # noqa: PLR2004 - nothing to compare

@@ -28,9 +28,10 @@ if TYPE_CHECKING:
 
 #: Maximum number of rows that fit on a page.
 _MOST_ROWS: Final = 24
-#: Intervals are drawn this far above the middle of their row, and the markers of pairs below it.
+#: Intervals are drawn above the middle of their row by this distance; the markers of pairs are
+#: drawn below the middle.
 _ABOVE: Final = 0.12
-#: Number of characters per line of a heading, and height of each additional line in units of rows.
+#: Number of characters per line of a heading, and height of a further line in rows.
 _LETTERS, _LINE = 70, 0.6
 _COLORS: Final = {
     Verdict.DIFFERENT: "#D55E00",
@@ -54,8 +55,8 @@ def draw_differences(c: Comparison) -> Drawn | None:
         ax = figure.subplots()
         ax.axvspan(-margin, margin, color=FAINT, alpha=0.13, linewidth=0)
         ax.axvline(0.0, color=FAINT, linewidth=0.8)
-        # The differences of the pairs limit the axis. With two pairs, an interval of the table can
-        # span many dB.
+        # The range of the axis is given by the differences of the pairs. With two pairs, an
+        # interval can be many dB wide.
         dots = [pair.difference for row in rows for pair in row.pairs]
         low, high = min([*dots, -2.0 * margin]), max([*dots, 2.0 * margin])
         ax.set_xlim(low - 0.1 * (high - low), high + 0.1 * (high - low))
@@ -81,12 +82,12 @@ def draw_differences(c: Comparison) -> Drawn | None:
 
 
 def _heading(row: Contrast) -> str:
-    """Return the names of two arms, on several lines if one line is too short for them."""
+    """Return the names of two arms, broken into several lines if needed."""
     return wrapped(literal(f"{row.first}  \u2212  {row.second}"), _LETTERS)
 
 
 def _draw(ax: "Axes", rows: Sequence[Contrast], scenes: Sequence[str]) -> list[float]:
-    """Draw the rows below the headings of their arms, and return the position of each row."""
+    """Draw the rows under the headings of their arms, and return the vertical positions."""
     positions: list[float] = []
     position = 0.0
     for heading, group in groupby(rows, _heading):
@@ -123,7 +124,7 @@ def _row(ax: "Axes", row: Contrast, position: float, scenes: Sequence[str]) -> N
 
 
 def _key(rows: Sequence[Contrast], scenes: Sequence[str]) -> list["Line2D"]:
-    """Return the legend of colours and markers."""
+    """Return the legend for colours and markers."""
     from matplotlib.lines import Line2D
 
     present = {row.verdict for row in rows}

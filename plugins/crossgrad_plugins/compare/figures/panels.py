@@ -1,4 +1,4 @@
-"""The grid of panels of all figures, and drawing functions that panels share."""
+"""The grid of panels that all figures use, and drawing functions for panels."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _IN_A_ROW: Final = 4
-#: Width of a figure with a single panel, as a share of the page.
+#: Width of a figure with one panel, as a share of the page width.
 _SINGLE: Final = 0.62
-#: A line with at most this many points has markers. On longer lines, markers would hide the line.
+#: A line with at most this many points gets markers. On longer lines, markers would hide the line.
 _MOST_MARKERS: Final = 4
-#: Maximum number of points of a line. Seeds that were evaluated at different seconds would give
-#: more points.
+#: Maximum number of points of a line. Runs that were evaluated at different seconds would otherwise
+#: give a line more points.
 _MOST_POINTS: Final = 60
 
 
@@ -44,10 +44,10 @@ class Grid:
         title: Title of the figure.
         caption: Description of the figure.
         y: Label of the vertical axes.
-        x: Label of the horizontal axes, or one label for each panel. A label appears below the
-            last panel of each column.
+        x: Label of the horizontal axes, or one label per panel. The label is shown below the last
+            panel of each column.
         height: Height of a row in inches.
-        has_titles: True if each panel shows its name.
+        has_titles: True if each panel shows its name as title.
     """
 
     name: str
@@ -65,8 +65,8 @@ class Grid:
 
         Args:
             panels: The name of each panel.
-            draw: Draws the panel with the given index into its axes.
-            arms: The arms of the legend.
+            draw: Function that draws a panel, with the panel's index and axes as arguments.
+            arms: The arms that the legend shows.
         """
         columns = min(_IN_A_ROW, len(panels))
         rows = ceil(len(panels) / columns)
@@ -89,7 +89,7 @@ class Grid:
             return drawn(figure, self.name, self.title, self.caption)
 
     def by_scene(self, c: Comparison, draw: Callable[["Axes", str], None]) -> Drawn:
-        """Draw the figure with a panel for each scene."""
+        """Draw the figure with one panel for each scene."""
         arms = [arm.name for arm in c.arms]
         return self.draw(c.scenes, lambda ax, index: draw(ax, c.scenes[index]), arms)
 
@@ -102,7 +102,7 @@ def draw_bands(
     cost: Cost,
     unit: float = 1.0,
 ) -> list[Array]:
-    """Draw a line with a band over seeds for each arm.
+    """Draw a line for each arm, with a band for the range over seeds.
 
     Args:
         ax: The panel.
@@ -110,9 +110,9 @@ def draw_bands(
         scene: The scene.
         quantity: The metric on the vertical axis.
         cost: The cost on the horizontal axis.
-        unit: Value that is drawn as 1 on the vertical axis.
+        unit: Value that corresponds to 1 on the vertical axis, for example 1,000 primitives.
 
-    Returns: The lowest [n] and highest [n] metric of each arm that has a curve.
+    Returns: The lowest [n] and the highest [n] metric of each arm that has a curve.
     """
     look = looks([arm.name for arm in c.arms])
     limits = []
@@ -122,7 +122,7 @@ def draw_bands(
         color = look[arm].color
         marker = look[arm].marker if 0 < len(x) <= _MOST_MARKERS else ""
         ax.fill_between(x, low, high, color=color, alpha=0.18, linewidth=0)
-        # An arm without a run on this scene also gets a legend entry.
+        # An arm without a run on this scene also needs a legend entry.
         ax.plot(x, middle, color=color, linestyle=look[arm].dash, marker=marker, label=literal(arm))
         if len(x):
             limits += [low, high]
@@ -134,11 +134,11 @@ def draw_bands(
 def band(
     c: Comparison, arm: str, scene: str, quantity: Quantity, cost: Cost
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the cost, and the lowest, mean and highest metric over the seeds of an arm.
+    """Return the costs, and the lowest, mean and highest metric over the seeds of an arm.
 
-    A run's metric is interpolated between its evaluations. The arrays [n] cover the range of costs
-    that all runs have in common. The arrays are empty if no run has a curve, or if the runs have no
-    common range.
+    The metric of a run is interpolated between its evaluations. The arrays [n] cover the costs that
+    all runs of the arm have reached. The arrays are empty if no run has a curve, or if the runs
+    have no common range of costs.
     """
     runs = [run for (at, _), run in c.main[arm].items() if at == scene]
     series = [(x, y) for x, y in (run.series(quantity.name, cost) for run in runs) if len(x)]

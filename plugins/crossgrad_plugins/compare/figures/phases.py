@@ -18,16 +18,16 @@ from crossgrad_plugins.compare.figures.style import (
 from crossgrad_plugins.compare.quantity import SECONDS
 
 _OTHER = "other"
-#: Number of characters per line of an arm's name next to its bar.
+#: Number of characters per line of an arm's name beside its bar.
 _LETTERS = 40
 _HATCHES = ("", "", "", "", "", "", "", "///", "...", "xxx")
 
 
 def phases_of(comparison: Comparison) -> dict[str, dict[str, float]]:
-    """Return milliseconds per step by arm and phase, averaged over the runs that recorded phases.
+    """Return milliseconds per step by arm and phase.
 
-    Phases are wall-clock seconds. The result is empty if wall-clock seconds are not comparable or
-    not requested.
+    The values are means over the runs that recorded phases. The milliseconds are wall-clock time.
+    The result is empty if wall-clock seconds are not comparable or were not requested.
     """
     by_arm: dict[str, dict[str, float]] = {}
     if SECONDS not in comparison.costs:
@@ -52,7 +52,10 @@ def phases_of(comparison: Comparison) -> dict[str, dict[str, float]]:
 
 
 def draw_phases(comparison: Comparison) -> Drawn | None:
-    """Draw milliseconds per step by phase, one bar per arm; return None without comparable runs."""
+    """Draw milliseconds per step by phase, one bar per arm.
+
+    Return None without comparable runs.
+    """
     by_arm = phases_of(comparison)
     if not by_arm:
         return None

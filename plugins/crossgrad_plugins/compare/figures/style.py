@@ -14,12 +14,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Okabe and Ito's colours without their yellow, which is hard to see on white.
+#: The palette of Okabe and Ito without yellow, which is hard to see on white.
 COLORS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A5C00")
 MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X")
 DASHES: Final = ("-", (0, (5, 1.6)), (0, (1, 1)), (0, (4, 1.2, 1, 1.2)))
 INK, FAINT, GRID = "#1a1a1a", "#666666", "#e2e2e2"
-#: Widths in inches: of a page of a paper without its margins, and of a text column.
+#: Widths in inches: the text width of a page, and the width of a column.
 PAGE, COLUMN = 7.0, 3.4
 _RC: Final[Any] = {
     "axes.edgecolor": FAINT,
@@ -52,14 +52,14 @@ _RC: Final[Any] = {
     "ytick.labelsize": 7.5,
 }
 _DPI: Final = 220
-#: Number of characters per page width, and number of characters that the marker and the gap of a
-#: label take. The third number is a divisor: one step shortens the lines of a label by the line
-#: length divided by it.
+#: Number of characters per page width, and number of characters that the marker and gap of a legend
+#: label need. The third number determines how much shorter lines are tried: the line length divided
+#: by this number.
 _LETTERS, _BESIDE, _LETTERS_AT_ONCE = 110, 8, 10
-#: Number of legend lines for which every figure has space, and height of a line in inches.
+#: Number of legend lines that every figure has space for, and height of a line in inches.
 _LEGEND_LINES, _LINE = 2, 0.18
-#: A name may be broken after the characters in brackets. A longer part without these characters may
-#: be broken anywhere.
+#: A name may be broken after one of these characters. A longer part without these characters may be
+#: broken at any position.
 _PARTS: Final = re.compile(r"[^\s_./-]{1,18}[\s_./-]*|[\s_./-]+")
 _SVG: Final = re.compile(r"<svg\b.*", re.DOTALL)
 _ID: Final = re.compile(r'(\bid="|url\(#|href="#)')
@@ -76,7 +76,7 @@ class Drawn:
         svg: SVG for the page; its colours are variables of the page's style sheet.
         pdf: PDF for a paper.
         png: PNG for other uses.
-        share: Width of the figure as a share of the page width.
+        share: Width of the figure, as a share of the page width.
     """
 
     name: str
@@ -90,7 +90,7 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Look:
-    """The colour, marker and line style of an arm in every figure."""
+    """The colour, marker and line style that an arm has in every figure."""
 
     color: str
     marker: str
@@ -100,12 +100,13 @@ class Look:
 def looks(arms: Sequence[str]) -> dict[str, Look]:
     """Return the look of each arm.
 
-    Arms also differ in marker and line style, for print without colours.
+    Arms differ in colour, marker and line style, so that they can be distinguished in print without
+    colours.
     """
     return {
         arm: Look(
             COLORS[index % len(COLORS)],
-            # When the colours repeat, marker and line style change.
+            # After the last colour, the colours start again with another marker and line style.
             MARKERS[(index + index // len(COLORS)) % len(MARKERS)],
             DASHES[(index % len(COLORS) + index // len(COLORS)) % len(DASHES)],
         )
@@ -144,7 +145,7 @@ def drawn(figure: "Figure", name: str, title: str, caption: str) -> Drawn:
         engine.execute(figure)
     figure.set_layout_engine("none")
     png, pdf, svg = io.BytesIO(), io.BytesIO(), io.StringIO()
-    # `savefig` would compute the layout again for every format.
+    # `savefig` alone would compute the layout again for every format.
     for_png: Any = FigureCanvasAgg(figure)
     for_png.print_png(png)
     for_pdf: Any = FigureCanvasPdf(figure)
@@ -166,7 +167,7 @@ def drawn(figure: "Figure", name: str, title: str, caption: str) -> Drawn:
 
 
 def _for_page(svg: str, name: str) -> str:
-    """Return the SVG element alone, with unique ids and with colours that the page sets."""
+    """Return the SVG element with unique ids and with colours that the page's style sheet sets."""
     match = _SVG.search(svg)
     text = _ID.sub(rf"\1{name}-", match[0] if match else svg)
     for variable, color in variables().items():
@@ -177,26 +178,29 @@ def _for_page(svg: str, name: str) -> str:
 
 
 def variables() -> dict[str, str]:
-    """Return the colour in figures of each style sheet variable of the page."""
+    """Return for each style sheet variable of the page its colour in figures."""
     series = {f"series-{number}": color for number, color in enumerate(COLORS)}
     return {"ink": INK, "faint": FAINT, "grid": GRID, **series}
 
 
 def literal(text: str) -> str:
-    """Return text for a legend; quote a leading underscore, which would hide the entry."""
+    """Return a text for a legend.
+
+    A leading underscore would hide the entry, so it is quoted.
+    """
     text = showable(text)
     return f"'{text}'" if text.startswith("_") else text
 
 
 def panel_title(ax: "Axes", scene: str) -> None:
-    """Write a scene's name above its panel, on several lines if the panel is too narrow."""
+    """Write a scene's name above its panel, in several lines if needed."""
     subplot = ax.get_subplotspec()
     beside = 1 if subplot is None else subplot.get_gridspec().ncols
     ax.set_title(wrapped(literal(one_line(scene)), _LETTERS // beside - _BESIDE), loc="left")
 
 
 def legend(figure: "Figure", axes: "Axes", arms: Sequence[str], columns: int = 4) -> None:
-    """Put the legend of the arms above all panels, with the handles of `axes`."""
+    """Put the legend of the arms, with the handles of `axes`, above all panels."""
     handles, labels = axes.get_legend_handles_labels()
     by_label = dict(zip(labels, handles, strict=True))
     shown = [literal(arm) for arm in arms if literal(arm) in by_label]
@@ -206,12 +210,12 @@ def legend(figure: "Figure", axes: "Axes", arms: Sequence[str], columns: int = 4
 def legend_above(
     figure: "Figure", handles: Sequence[Any], labels: Sequence[str], columns: int
 ) -> None:
-    """Put a legend above all panels; the figure grows if the legend needs further lines.
+    """Put a legend above all panels; the figure grows if the legend has many lines.
 
     Args:
         figure: The figure.
         handles: A handle for each label.
-        labels: The labels; a label wider than the figure continues on further lines.
+        labels: The labels; a label that is wider than the figure gets several lines.
         columns: Maximum number of columns.
     """
     letters = int(_LETTERS * figure.get_figwidth() / PAGE)
@@ -230,7 +234,7 @@ def legend_above(
         box = made.get_window_extent()
         if box.width <= figure.bbox.width or letters <= _BESIDE:
             break
-        made.remove()  # The characters were wider than estimated, so try shorter lines.
+        made.remove()  # If the characters are wider than estimated, try shorter lines.
         if columns > 1:
             columns -= 1
         else:
@@ -240,7 +244,7 @@ def legend_above(
 
 
 def wrapped(text: str, room: int) -> str:
-    """Break a text into lines of at most `room` letters, if its parts are short enough."""
+    """Break a text into lines of at most `room` letters, if possible."""
     lines = [""]
     for part in _PARTS.findall(text):
         if lines[-1] and len(lines[-1] + part) > room:

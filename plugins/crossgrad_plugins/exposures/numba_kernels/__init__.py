@@ -1,1 +1,1 @@
-"""Kernels of exposures."""
+"""Compiled kernels of the exposures."""

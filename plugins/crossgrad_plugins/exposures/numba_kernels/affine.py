@@ -7,21 +7,21 @@ from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import kernel
 
-_Floats: TypeAlias = NDArray[np.float32]  # 1-D
-_Sums: TypeAlias = NDArray[np.float64]  # [3, 4]
+_Floats: TypeAlias = NDArray[np.float32]
+_Sums: TypeAlias = NDArray[np.float64]
 
-# Number of pixels summed in float32 before the sum is added in float64.
+# Number of pixels that are summed in float32 before their sum is added in float64.
 _PIXELS = 256
 
 
 @kernel
 def map_colors(image: _Floats, matrix: _Floats, taken: _Floats) -> None:
-    """Write A x + b of every pixel x.
+    """Write A x + b for the colour x of every pixel.
 
     Args:
-        image: Values in the order R, G, B, R ...
-        matrix: [12] the rows of [A | b].
-        taken: Output, of the same length.
+        image: Values of the pixels, in the order R, G, B, R ...
+        matrix: [12] the rows of [A | b], one after the other.
+        taken: Output, as long as `image`.
     """
     for pixel in range(len(image) // 3):
         red, green, blue = image[3 * pixel], image[3 * pixel + 1], image[3 * pixel + 2]
@@ -35,14 +35,14 @@ def map_colors(image: _Floats, matrix: _Floats, taken: _Floats) -> None:
 def map_colors_back(
     image: _Floats, matrix: _Floats, upstream: _Floats, gradient: _Floats, sums: _Sums
 ) -> None:
-    """Write the gradient of the colours, and add up the gradient of the matrix.
+    """Write the gradient with respect to the colours, and add up the one for the matrix.
 
     Args:
         image: The image, as for `map_colors`.
         matrix: [12], as for `map_colors`.
-        upstream: The gradient of the output of `map_colors`.
-        gradient: Output: the gradient of the colours.
-        sums: [3, 4] output: the gradient of [A | b]; must be zero.
+        upstream: The gradient with respect to the output of `map_colors`.
+        gradient: Output: the gradient with respect to the colours.
+        sums: [3, 4] output: the gradient with respect to [A | b]; must be zero at the start.
     """
     partial = np.zeros((3, 4), dtype=np.float32)
     pixels = len(image) // 3

@@ -1,10 +1,10 @@
 """Gains in linear light on sRGB values, and their gradients (CPU, float32, one thread).
 
-sRGB's curve has a straight part for dark values, and a power part above it. If a value is in the
-power part before and after the gain G, decoding, multiplying and encoding are one linear map of x:
-with o = 0.055, G^(1/2.4) (x + o) - o. If x is in the straight part before and after, the map is G
-x. Only values that move from one part to the other need a power function; they are found in blocks
-of eight values.
+The sRGB curve is linear for dark values, and a power function above them. If a value x is in the
+power part before and after the gain G, the whole computation is one linear map. The map is x ->
+G^(1/2.4) (x + o) - o with o = 0.055. If x is in the linear part before and after the gain, the map
+is x -> G x. Only values that move from one part to the other need a power function. Such values are
+searched for in blocks of eight.
 """
 
 from typing import TypeAlias
@@ -32,12 +32,12 @@ from crossgrad_plugins.exposures.srgb import (
     THRESHOLD_LINEAR,
 )
 
-_Floats: TypeAlias = NDArray[np.float32]  # 1-D
-_Sums: TypeAlias = NDArray[np.float64]  # [3]
+_Floats: TypeAlias = NDArray[np.float32]
+_Sums: TypeAlias = NDArray[np.float64]
 
-#: Number of values after which channels and lanes are aligned again.
+#: Number of values after which the channels start again in the first SIMD lane.
 PERIOD = 3 * LANES
-# Number of blocks summed in float32 before the sum is added in float64.
+# Number of blocks that are summed in float32 before their sum is added in float64.
 _ROUNDS = 32
 _ALL = np.uint64(2**LANES - 1)
 
@@ -46,8 +46,8 @@ _OFFSET, _STRETCH = np.float32(OFFSET), np.float32(STRETCH)
 _SLOPE, _EXPONENT = np.float32(SLOPE), np.float32(EXPONENT)
 _ROOT = np.float32(1.0 / EXPONENT)
 _THRESHOLD, _THRESHOLD_LINEAR = np.float32(THRESHOLD), np.float32(THRESHOLD_LINEAR)
-# df/dstops divided by f + o in the power part of the sRGB curve, and divided by f in the straight
-# part.
+# Derivative with respect to stops, divided by f + o in the power part and by f in the linear part;
+# f is the value after the gain.
 _OF_POWER, _OF_LINE = np.log(2.0) / EXPONENT, np.log(2.0)
 
 
@@ -65,7 +65,7 @@ def _exposed(value: np.float32, gain: np.float32) -> np.float32:
 
 @device
 def _slope(value: np.float32, taken: np.float32, gain: np.float32) -> np.float32:
-    """Return the derivative of a value after the gain with respect to the value before it."""
+    """Return the derivative of the value after the gain by the value before the gain."""
     if taken <= _THRESHOLD:
         if value <= _THRESHOLD:
             return gain
@@ -77,10 +77,10 @@ def _slope(value: np.float32, taken: np.float32, gain: np.float32) -> np.float32
 
 @device
 def _sides(values: Lanes, straight: Lanes, bright: Lanes) -> tuple[np.uint64, np.uint64]:
-    """Return two sets of bits.
+    """Return two bit masks of a block of values.
 
-    They mark the values that stay in the straight part of the curve, and the values that stay in
-    the power part.
+    They mark the values that stay in the linear part of the curve, and the values that stay in the
+    power part.
     """
     dark = splat(_THRESHOLD)
     both = bits(values <= dark) & bits(straight <= dark)
@@ -93,9 +93,9 @@ def expose(image: _Floats, gains: _Floats, slopes: _Floats, taken: _Floats) -> N
 
     Args:
         image: Values in the order R, G, B, R ...
-        gains: [24] the channels' gains, repeated.
-        slopes: [24] the gains to the power of 1 / 2.4.
-        taken: Output, of the same length.
+        gains: [24] the gains of the channels, repeated.
+        slopes: [24] the gains of the channels to the power of 1 / 2.4, repeated.
+        taken: Output, as long as `image`.
     """
     offset, dark = splat(_OFFSET), splat(_THRESHOLD)
     whole = len(image) // PERIOD * PERIOD
@@ -120,15 +120,15 @@ def expose_back(
     image: _Floats, taken: _Floats, upstream: _Floats, gains: _Floats, gradient: _Floats,
     sums: _Sums,
 ) -> None:  # fmt: skip
-    """Write the gradient of the values, and add up the gradient of the stops of each channel.
+    """Write the gradient with respect to the values, and add up the one for each channel's stops.
 
     Args:
         image: The image, as for `expose`.
         taken: The output of `expose`.
-        upstream: The gradient of the output of `expose`.
+        upstream: The gradient with respect to the output of `expose`.
         gains: [24], as for `expose`.
-        gradient: Output: the gradient of the values.
-        sums: [3] output: the gradient of the stops; must be zero.
+        gradient: Output: the gradient with respect to the values.
+        sums: [3] output: the gradient with respect to the stops; must be zero at the start.
     """
     partial = np.zeros((2, PERIOD), dtype=np.float32)
     flat = partial.ravel()
@@ -141,8 +141,8 @@ def expose_back(
             values, after = load(image, start + lane), load(taken, start + lane)
             given = load(upstream, start + lane)
             before_line, after_line = values <= dark, after <= dark
-            # If the gain moves a value out of the straight part of the curve, the divisor of the
-            # slope is the value times the exponent.
+            # If a gain moves a value out of the linear part of the curve, the divisor is the value
+            # times the exponent of the power part.
             below = where(before_line, exponent * values, values + offset)
             above = where(after_line, exponent * after, after + offset)
             slope = where(
@@ -171,7 +171,7 @@ def _by_stops(taken: np.float32) -> float:
 
 @device
 def _settle(partial: _Floats, sums: _Sums) -> None:
-    """Add the sums over the straight part and over the power part to the channels' sums."""
+    """Add the sums of the linear part and of the power part to the sums of the channels."""
     for j in range(PERIOD):
         of_line, of_power = np.float64(partial[0, j]), np.float64(partial[1, j])
         sums[j % 3] += _OF_LINE * of_line + _OF_POWER * of_power

@@ -1,11 +1,12 @@
-"""Relative brightness of the photos of a scene, by a robust fit to SfM tracks.
+"""Relative brightness of a scene's photos, by a robust fit to SfM tracks.
 
-Model: stops of photo i at point j = gain_i + point_j, Huber's loss, mean gain 0. The system is
-solved by iteratively reweighted least squares, with the points eliminated. The remaining matrix
-couples each photo with the photos that show common points. If these photos are few, as in a strip
-of hundreds of photos, the matrix is solved directly, because conjugate gradients would need many
-iterations. If there are many such photos, conjugate gradients need few iterations and the direct
-solution is slow. If the photos form several parts without common points, each part has a mean of 0.
+The model is: stops of photo i at point j = gain_i + point_j, with Huber's loss and a mean gain of
+0. The system is solved by iteratively reweighted least squares. The unknowns of the points are
+eliminated first. The remaining matrix couples each photo with the photos that show some of the same
+points. A strip of hundreds of photos has few such photos for each photo. Conjugate gradients would
+then need many iterations, so the matrix is solved directly. If each photo is coupled with many
+photos, conjugate gradients need few iterations, and a direct solution is slow. If the photos form
+several groups without common points, the mean gain of each group is 0.
 """
 
 from collections.abc import Sequence
@@ -24,36 +25,35 @@ if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
 
-#: Minimum number of usable observations for the gain of a photo.
+#: Minimum number of usable observations of a photo for a gain.
 LEAST = 8
-#: Photos count as differing in exposure if three conditions hold. The standard deviation of the
-#: gains is at least the first value, in stops. It is also at least the second value times its own
-#: standard error. The gains reduce the deviation of observations by at least the third value, a
-#: share (docs/exposure.md).
+#: The photos differ in exposure if the next three conditions hold. The standard deviation of the
+#: gains is at least the first value, in stops. The standard deviation is at least the second value
+#: times its standard error. The gains reduce the deviation of the observations by at least the
+#: third value, a share (docs/exposure.md).
 LEAST_SPREAD, LEAST_RATIO, LEAST_REDUCTION = 0.2, 4.0, 0.15
-#: If there are at least this many photos, the photo farthest from the mean is ignored, because all
-#: its points may be on an object that the other photos hide.
+#: With at least this many photos, the photo farthest from the mean is ignored. All its points may
+#: be on an object that the other photos do not show.
 _ENOUGH = 5
-#: Maximum number of photos for the decision. If there are more, groups of consecutive photos are
-#: used, because consecutive photos show the same points.
+#: Maximum number of photos whose gains are fitted separately for the decision. If a scene has more
+#: photos, consecutive photos are treated as one group, because they show the same points.
 MOST_DECIDING, _CONSECUTIVE = 128, 8
-# The results are cached, because a run requests the gains several times and a scene does not
-# change.
+# Cache of the gains, because a run needs them several times and a scene does not change.
 _OF_TRAINING: "WeakKeyDictionary[Scene, TrackGains]" = WeakKeyDictionary()
 _DECIDING: "WeakKeyDictionary[Scene, TrackGains]" = WeakKeyDictionary()
-#: Huber's constant in standard deviations. It gives an efficiency of 95 % for normal errors.
+#: Huber's constant, in standard deviations. With this constant, the fit has an efficiency of 95 %
+#: for normal errors.
 _HUBER = 1.345
-#: Number of standard deviations of a normal distribution in one median absolute deviation.
+#: Ratio of the standard deviation to the median absolute deviation of a normal distribution.
 _NORMAL = 1.4826
 _ROUNDS = 12
-#: The equations are solved directly if the mean number of photos that share points with a photo is
-#: at most the first value, and the total number of photos is above the second value. With fewer
-#: photos, iterations converge quickly.
+#: Two limits for a direct solution: the maximum mean number of photos that share points with a
+#: photo, and the minimum number of all photos. With fewer photos, the iterations converge quickly.
 _FEW, _SHORT = 64, 64
-#: Maximum error of the gains after the iterations, in stops. The rounding error is smaller than
-#: this.
+#: Maximum error of the gains after the iterative solution, in stops.
 _TOLERANCE = 1e-5
-#: Standard errors are computed for at most this number of photos, because they need a dense matrix.
+#: Standard errors are computed for at most this number of photos, because their computation needs a
+#: dense matrix.
 _DENSE = 512
 #: Eigenvalues below this share of the largest eigenvalue count as 0. They belong to the mean gain
 #: of a connected group of photos, which the observations do not determine.
@@ -65,15 +65,15 @@ _Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The relative brightness of photos.
+    """The result of a fit: the relative brightness of photos.
 
     Attributes:
         gains: [V] stops of each photo above their mean; 0 without observations.
-        before: Mean distance of the observations from the means of their points, stops. A point
-            is weighted by the variance of the gains of the photos that show it, because only
-            points that join photos of different gains test these gains.
-        after: The same distance after the gains are removed.
-        errors: [V] standard errors of the gains, stops; NaN for more photos than `_DENSE`.
+        before: Mean distance of the observations from the means of their points before the fit,
+            stops. Each point is weighted by the variance of the gains of the photos that show it,
+            because a point tests only differences between its own photos.
+        after: The mean distance after the gains are subtracted, stops.
+        errors: [V] standard errors of the gains, stops; NaN if there are more than `_DENSE` photos.
     """
 
     gains: _Floats
@@ -83,7 +83,7 @@ class Fit:
 
     @property
     def reduction(self) -> float:
-        """The share of the deviation that the gains remove."""
+        """The share of the deviation that the gains explain."""
         return 1.0 - self.after / self.before if self.before > 0.0 else 0.0
 
 
@@ -92,8 +92,8 @@ class TrackGains:
     """The relative brightness of photos at points that several photos show.
 
     Attributes:
-        gains: [V] stops above the mean of the photos; 0 without enough observations.
-        counts: [V] usable observations.
+        gains: [V] stops above the mean of the photos; 0 for photos without enough observations.
+        counts: [V] number of usable observations.
         fit: The fit of the gains to the observations.
     """
 
@@ -113,19 +113,19 @@ class TrackGains:
 
     @property
     def error(self) -> float:
-        """Standard error of the gains, stops, root mean square over the photos."""
+        """Root mean square of the standard errors of the gains, stops."""
         errors = self.fit.errors[self.known]
         return float(np.sqrt(np.square(errors).mean())) if len(errors) else 0.0
 
     @property
     def differ(self) -> bool:
-        """True if the photos differ in exposure, by the rule."""
+        """True if the photos differ in exposure by the three conditions."""
         sure = self.spread >= LEAST_RATIO * self.error
         return sure and self._lasting >= LEAST_SPREAD and self.fit.reduction >= LEAST_REDUCTION
 
     @property
     def _lasting(self) -> float:
-        """The spread without the photo farthest from the mean, if there are enough photos."""
+        """The standard deviation without the photo farthest from the mean."""
         gains = self.gains[self.known]
         if len(gains) < _ENOUGH:
             return self.spread
@@ -133,7 +133,7 @@ class TrackGains:
 
     @property
     def evidence(self) -> str:
-        """The values that the rule compares, as text."""
+        """The three compared values, as text."""
         gains = self.gains[self.known]
         if not len(gains):
             return "no SfM tracks connect the photos, so their brightness cannot be compared"
@@ -159,7 +159,7 @@ def track_gains(scene: Scene, views: Sequence[View]) -> TrackGains:
 
 
 def training_gains(scene: Scene) -> TrackGains:
-    """Return the gains of all training photos; computed once per scene."""
+    """Return the gains of all training photos, from the cache if possible."""
     gains = _OF_TRAINING.get(scene)
     if gains is None:
         gains = _OF_TRAINING[scene] = track_gains(scene, scene.train_views)
@@ -167,7 +167,7 @@ def training_gains(scene: Scene) -> TrackGains:
 
 
 def deciding_gains(scene: Scene) -> TrackGains:
-    """Return the gains that decide whether the training photos differ; computed once per scene."""
+    """Return the gains that decide if the training photos differ, from the cache if possible."""
     views = scene.train_views
     if len(views) <= MOST_DECIDING:
         return training_gains(scene)
@@ -180,7 +180,7 @@ def deciding_gains(scene: Scene) -> TrackGains:
 
 
 def fitted(observations: Observations, photos: int) -> Fit:
-    """Fit the gains of `photos` photos."""
+    """Fit the gains of `photos` photos to observations."""
     o = observations
     if not o.count:
         return Fit(np.zeros(photos), 0.0, 0.0, np.zeros(photos))
@@ -205,9 +205,9 @@ def fitted(observations: Observations, photos: int) -> Fit:
 
 
 def _variances(o: Observations, gains: _Floats) -> _Floats:
-    """Return the variance [N] of the gains of the photos that show each observation's point.
+    """Return [N] the variance of the gains of the photos that show each observation's point.
 
-    All variances are 1 if no point joins photos of different gains.
+    All variances are 1 if no point is shown by photos with different gains.
     """
     even = np.ones(o.count)
     above = gains[o.photos] - _means(o.points, gains[o.photos], even)[o.points]
@@ -220,7 +220,7 @@ def _errors(
 ) -> _Floats:
     """Return the standard errors [V] of the gains by weighted least squares.
 
-    Groups of photos that few points connect have large errors, even with many observations.
+    If few points connect two groups of photos, the errors are large, even with many observations.
     """
     photos = len(parts)
     if photos > _DENSE:
@@ -233,24 +233,24 @@ def _errors(
 
 
 def _parts(o: Observations, photos: int) -> NDArray[np.int64]:
-    """Return the part [V] of each photo; the photos of a part are connected by common points."""
+    """Return [V] the connected group of each photo; photos of a group are connected by points."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     size = photos + int(o.points.max()) + 1
-    # Graphs in older versions of scipy require 32-bit indices.
+    # Old versions of scipy require 32-bit indices for graphs.
     ends = o.photos.astype(np.int32), (photos + o.points).astype(np.int32)
     edges = coo_array((np.ones(o.count), ends), shape=(size, size))
     return np.asarray(connected_components(edges, directed=False)[1][:photos], dtype=np.int64)
 
 
 def _means(points: NDArray[np.int64], values: _Floats, weights: _Floats) -> _Floats:
-    """Return the weighted mean of each observation's point [N]."""
+    """Return [N] the weighted mean at each observation's point."""
     return np.asarray(np.bincount(points, values * weights) / np.bincount(points, weights))
 
 
 def _neighbours(o: Observations, photos: int) -> float:
-    """Return the mean number of photos that share points with a photo, itself included."""
+    """Return the mean number of photos with shared points, including the photo itself."""
     from scipy.sparse import coo_array
 
     shape = photos, int(o.points.max()) + 1
@@ -259,9 +259,9 @@ def _neighbours(o: Observations, photos: int) -> float:
 
 
 def _direct(o: Observations, weights: _Floats, parts: NDArray[np.int64]) -> _Floats:
-    """Return the gains of least weighted squares, by a direct solver.
+    """Return the gains of weighted least squares by a direct solver.
 
-    The first photo of each part has the gain 0.
+    The first photo of each connected group has the gain 0.
     """
     from scipy.sparse.linalg import spsolve
 
@@ -278,7 +278,7 @@ def _direct(o: Observations, weights: _Floats, parts: NDArray[np.int64]) -> _Flo
 
 
 def _normal_matrix(o: Observations, weights: _Floats, count: int) -> "csc_array":
-    """Return the matrix [V, V] of the normal equations of the gains, the points eliminated."""
+    """Return [V, V] the normal equations of the gains, after elimination of the points."""
     from scipy.sparse import coo_array
 
     of_points = np.bincount(o.points, weights)
@@ -289,13 +289,13 @@ def _normal_matrix(o: Observations, weights: _Floats, count: int) -> "csc_array"
 
 
 def _iterated(o: Observations, weights: _Floats, start: _Floats) -> _Floats:
-    """Return the gains of least weighted squares, by conjugate gradients (Jacobi)."""
+    """Return the gains of weighted least squares by conjugate gradients (Jacobi preconditioner)."""
     count = len(start)
     diagonal = np.bincount(o.photos, weights, count)
     scale = 1.0 / np.maximum(diagonal, _SMALLEST)
 
     def deviations(values: _Floats) -> _Floats:
-        """Sum each photo's weighted deviations from the means of its points."""
+        """Return for each photo the sum of weighted deviations from the means of its points."""
         above = values - _means(o.points, values, weights)[o.points]
         return np.asarray(np.bincount(o.photos, weights * above, count))
 

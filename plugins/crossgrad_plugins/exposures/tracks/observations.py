@@ -13,11 +13,11 @@ from torch import Tensor
 from crossgrad_core.plugin import Camera, Scene, UserError, View
 from crossgrad_plugins.exposures.srgb import decoded
 
-#: Maximum number of observations. If there are more, only every n-th point is used.
+#: Maximum number of observations. If a scene has more observations, only every n-th point is used.
 _MOST = 400_000
-#: Number of photos that are decoded in parallel. More photos would need too much memory.
+#: Number of photos that are decoded at the same time. More photos would need too much memory.
 _AT_ONCE = 2
-#: Usable range of linear light in [0, 1]: values below it are noise, values above it are clipped.
+#: Usable range of linear light in [0, 1]: lower values are noise, and higher values are clipped.
 DARKEST, BRIGHTEST = 0.02, 0.98
 _NEIGHBOURS = tuple((down, right) for down in (-1, 0, 1) for right in (-1, 0, 1))
 
@@ -27,10 +27,10 @@ class Observations:
     """Usable observations of points that at least two of the photos show.
 
     Attributes:
-        photos: [O] index of the photo among the given views.
-        points: [O] numbers of the points, from 0 on without gaps.
+        photos: [O] index of each observation's photo among the given views.
+        points: [O] number of each observation's point, counted from 0 without gaps.
         stops: [O] log2 of the brightness in linear light.
-        rows: [N] row of each numbered point among the points of the scene.
+        rows: [N] index of each numbered point among the points of the scene.
     """
 
     photos: NDArray[np.int64]
@@ -47,9 +47,9 @@ class Observations:
 def observations_of(scene: Scene, views: Sequence[View]) -> Observations:
     """Measure the brightness of the scene's points in the photos of some views.
 
-    A photo is sampled at the projections of the points that it observed, with 3 x 3 pixels for each
-    point. Photos without such points are not decoded. A photo that cannot be decoded has no
-    observations; the run reports the error when it needs the photo.
+    A photo is sampled with 3 x 3 pixels at the projection of each point that it observed. Photos
+    that observed no usable point are not decoded. A photo that cannot be decoded has no
+    observations. The run reports the error when it uses the photo.
     """
     shared = _shared_points(scene, views)
     with ThreadPoolExecutor(_AT_ONCE) as pool:
@@ -57,7 +57,7 @@ def observations_of(scene: Scene, views: Sequence[View]) -> Observations:
     photos = np.repeat(np.arange(len(views)), [len(rows) for rows, _ in observed])
     rows = np.concatenate([np.zeros(0, dtype=np.int64), *(rows for rows, _ in observed)])
     stops = np.concatenate([np.zeros(0), *(stops for _, stops in observed)])
-    # A point that is usable in only one photo gives no information about that photo.
+    # A point that is usable in only one photo gives no information about relative brightness.
     _, numbers, times = np.unique(rows, return_inverse=True, return_counts=True)
     kept = times[numbers] > 1
     usable_rows, numbers = np.unique(rows[kept], return_inverse=True)
@@ -65,9 +65,9 @@ def observations_of(scene: Scene, views: Sequence[View]) -> Observations:
 
 
 def _shared_points(scene: Scene, views: Sequence[View]) -> NDArray[np.bool_]:
-    """Return which points [P] are used.
+    """Return [P], True for points whose brightness is measured.
 
-    Usable points are seen by at least two views. If there are very many such points, only a part is
+    At least two views must show a point. If there are too many points, only every n-th point is
     used.
     """
     times = np.zeros(len(scene.points), dtype=np.int64)
@@ -84,7 +84,7 @@ def _shared_points(scene: Scene, views: Sequence[View]) -> NDArray[np.bool_]:
 def _observed(
     scene: Scene, view: View, shared: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the rows of the points that a photo shows in usable brightness, and their stops."""
+    """Return the indices of points that a photo shows with usable brightness, and their stops."""
     seen = view.seen[shared[view.seen]]
     if not len(seen):
         return seen, np.zeros(0)
@@ -103,8 +103,8 @@ class Light:
     """The brightness of an image at some points.
 
     Attributes:
-        rows: [S] indices of the given points that are inside the image.
-        brightness: [S] linear light, mean over 3 x 3 pixels and the channels; 1 is white.
+        rows: [S] indices of the given points that are projected inside the image.
+        brightness: [S] linear light, mean over 3 x 3 pixels and three channels; 1 is white.
     """
 
     rows: NDArray[np.int64]
@@ -119,7 +119,7 @@ class Light:
 def light_at(
     image: Tensor, mask: Tensor | None, camera: Camera, points: NDArray[np.float64]
 ) -> Light:
-    """Measure the light of an image at points.
+    """Measure the brightness of an image at points.
 
     Args:
         image: [H, W, 3] sRGB values, uint8 or floating point, on the CPU.
@@ -129,8 +129,8 @@ def light_at(
     """
     pixels, depths = camera.project(points)
     height, width = image.shape[:2]
-    # The neighbours must also be inside the image. This test also removes values that are too large
-    # for an index.
+    # All 3 x 3 pixels must be inside the image. This test also removes coordinates that are too
+    # large for an integer index.
     inside = (pixels >= 1.0).all(axis=1) & (pixels < [width - 1, height - 1]).all(axis=1)
     rows = np.flatnonzero(inside & (depths > 0.0))
     right, down = (pixels[rows, axis].astype(np.int64) for axis in (0, 1))
@@ -144,7 +144,7 @@ def light_at(
 
 
 def _linear(values: NDArray[np.generic]) -> NDArray[np.float64]:
-    """Return sRGB values in linear light [S, 3]."""
+    """Return linear light [S, 3] of sRGB values."""
     if values.dtype == np.uint8:
         return np.asarray(_of_eight_bits()[values])
     return np.asarray(decoded(torch.from_numpy(values.astype(np.float64))))

@@ -1,11 +1,12 @@
-"""The photometric loss in plain torch: by autograd, or with an explicit gradient for a GPU.
+"""The photometric loss in plain torch, by autograd or with an explicit gradient for a GPU.
 
-This is the readable definition, and the reference for tests of the fused kernel.
+This module is the readable definition of the loss, and the reference for tests of the compiled
+kernel.
 
-Autograd launches more kernels, and most of them run for less time than their launch takes. The
-explicit gradient uses sums and differences, as the fused CPU kernel does (`numba_kernels.fused`).
-The explicit gradient filters twelve planes forward and nine backward, while autograd filters
-fifteen each.
+On a GPU, autograd launches more kernels, and most of these kernels take less time than their
+launch. The explicit gradient uses s = x + y and d = x - y, as the compiled CPU kernel does
+(`numba_kernels.fused`). It filters twelve planes in the forward pass and nine in the backward pass.
+Autograd filters fifteen planes in each pass.
 """
 
 from functools import cache
@@ -16,9 +17,9 @@ from torch.nn.functional import conv2d
 
 from crossgrad_core.plugin import masked, unit_range
 
-WINDOW = 11  # pixels
+WINDOW = 11
 RADIUS = WINDOW // 2
-SIGMA = 1.5  # pixels
+SIGMA = 1.5
 C1 = 0.01**2
 C2 = 0.03**2
 
@@ -37,23 +38,23 @@ def l1_ssim_loss(
     ssim_weight: float = 0.2,
     weights: Tensor | None = None,
 ) -> Tensor:
-    """Return (1 - w) * L1 + w * (1 - SSIM), both averaged over the unmasked pixels and channels.
+    """Return (1 - w) * L1 + w * (1 - SSIM), both averaged over unmasked pixels and channels.
 
-    A masked pixel is 0 in both images before SSIM's windows are summed. A masked pixel contributes
-    to neither mean, and receives exactly zero gradient. If no pixel counts, the loss is 0.
+    A masked pixel is set to 0 in both images before the window sums of SSIM. A masked pixel does
+    not enter the two means, and its gradient is exactly zero. If no pixel counts, the loss is 0.
 
     Args:
-        image: [H, W, C] floating point; values may be outside [0, 1].
-        target: [H, W, C] floating point, or uint8 (then 255 means 1).
-        mask: [H, W] bool, True where the pixel counts; None counts all pixels.
-        ssim_weight: w in [0, 1].
-        weights: [H, W] floating point, not negative: a pixel's weight in both means. The weights do
-            not affect the window sums of SSIM. None gives all pixels the same weight.
+        image: [H, W, C] the render, floating point; values may be outside [0, 1].
+        target: [H, W, C] the photo, floating point, or uint8 with 255 for 1.
+        mask: [H, W] bool, True for pixels that count; None if all pixels count.
+        ssim_weight: The weight w of the SSIM term, in [0, 1].
+        weights: [H, W] non-negative weights of the pixels in both means, floating point. The
+            weights do not affect the window sums of SSIM. None means equal weights.
 
     Returns:
-        Scalar of the image's type.
+        The loss, a scalar of the image's type.
 
-    Source: Kerbl et al. 2023 (3D Gaussian Splatting), eq. 7, with 1 - SSIM as D-SSIM.
+    Source: Kerbl et al. 2023 (3D Gaussian Splatting), eq. 7, with 1 - SSIM for D-SSIM.
     """
     image, target = masked(image, mask), masked(unit_range(target, image.dtype), mask)
     absolute = (image - target).abs()
@@ -70,21 +71,22 @@ def l1_ssim_loss(
 
 
 def _weighted(values: Tensor, mask: Tensor | None, weights: Tensor) -> Tensor:
-    """Return the weighted mean of [H, W, C] over the kept pixels; 0 if the total weight is 0."""
-    share = masked(weights.to(values.dtype).unsqueeze(-1), mask)  # [H, W, 1]
+    """Return the weighted mean of [H, W, C] over unmasked pixels; 0 if the total weight is 0."""
+    share = masked(weights.to(values.dtype).unsqueeze(-1), mask)
     total = share.sum() * values.shape[-1]
-    # If no pixel counts, the sum is already 0, but the divisor must not be 0.
+    # If no pixel counts, the sum is 0, and the divisor must not be 0.
     return (masked(values, mask) * share).sum() / torch.where(total > 0, total, 1.0)
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
-    """Return the SSIM of every pixel and channel, [H, W, C]; windows are zero-padded.
+    """Return [H, W, C] SSIM of every pixel and channel; windows are padded with zeros.
 
     Args:
-        image: [H, W, C] floating point.
-        target: [H, W, C] of the same type.
+        image: [H, W, C] the render, floating point.
+        target: [H, W, C] the photo, of the same type.
 
-    Source: Wang et al. 2004, eq. 13, 11 x 11 Gaussian window, sigma 1.5, L = 1.
+    Source: Wang et al. 2004, eq. 13, with an 11 x 11 Gaussian window, sigma 1.5 and dynamic range L
+    = 1.
     """
     x, y = image, target
     fields = torch.stack((x, y, x * x, y * y, x * y)).permute(0, 3, 1, 2)
@@ -100,22 +102,22 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
 
 @cache
 def _window_for(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return the window on a device, copied only once, because a copy synchronises with the GPU.
+    """Return the window on a device.
 
-    The first call may be in inference mode. The window is created outside inference mode, so that
-    calls with gradients can also use it.
+    The window is copied only once, because a copy synchronises with the GPU. The first call may
+    happen in inference mode. The window is therefore created outside inference mode, so that later
+    calls with gradients can use it.
     """
     with torch.inference_mode(mode=False):
         return gaussian_window().to(device, dtype)
 
 
 def blurred(fields: Tensor) -> Tensor:
-    """Return Gaussian-weighted sums of [M, C, H, W] over each pixel's window, same shape."""
+    """Return [M, C, H, W] Gaussian-weighted sums over the window of each pixel."""
     if fields.numel() == 0:
         return fields
-    # Use one group per plane, because torch's depthwise convolution is the fastest variant on the
-    # CPU.
-    planes = fields.reshape(1, -1, *fields.shape[2:])  # [1, M * C, H, W]
+    # Use one convolution group per plane, because this is torch's fastest variant on the CPU.
+    planes = fields.reshape(1, -1, *fields.shape[2:])
     groups = planes.shape[1]
     weight = _window_for(fields.dtype, fields.device).expand(groups, 1, WINDOW)
     planes = conv2d(planes, weight.unsqueeze(-1), padding=(RADIUS, 0), groups=groups)
@@ -127,13 +129,13 @@ def blurred(fields: Tensor) -> Tensor:
 def loss_and_gradient(
     image: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the value of `l1_ssim_loss`, and its gradient with respect to the image [H, W, C].
+    """Return the value of `l1_ssim_loss`, and its gradient [H, W, C] with respect to the image.
 
     Args:
-        image: [H, W, C] floating point.
-        target: [H, W, C] floating point, or uint8 (then 255 means 1).
-        mask: [H, W] bool; None counts all pixels.
-        ssim_weight: w in [0, 1].
+        image: [H, W, C] the render, floating point.
+        target: [H, W, C] the photo, floating point, or uint8 with 255 for 1.
+        mask: [H, W] bool; None if all pixels count.
+        ssim_weight: The weight w of the SSIM term, in [0, 1].
     """
     x = masked(image, mask).permute(2, 0, 1)
     y = masked(unit_range(target, image.dtype), mask).permute(2, 0, 1)
@@ -153,23 +155,23 @@ def loss_and_gradient(
 def _dissimilarity_and_slope(
     sums: Tensor, differences: Tensor, mask: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Return 1 - SSIM of every pixel [C, H, W], and the gradient of the SSIM sum over kept pixels.
+    """Return 1 - SSIM [C, H, W], and the gradient of the SSIM sum over unmasked pixels.
 
     Args:
         sums: [C, H, W] image plus target.
         differences: [C, H, W] image minus target.
-        mask: [H, W] bool; None counts all pixels.
+        mask: [H, W] bool; None if all pixels count.
     """
     fields = torch.stack((sums, differences, sums * sums, differences * differences))
     mean_s, mean_d, square_s, square_d = blurred(fields)
     dark, bright = mean_d * mean_d, mean_s * mean_s
-    # Rounding may make a variance of zero slightly negative.
+    # Rounding can make a variance of zero slightly negative.
     variance_s = (square_s - bright).clamp_(min=0.0).add_(2 * C2)
     variance_d = (square_d - dark).clamp_(min=0.0)
     bright.add_(2 * C1)
     over_mean, over_variance = 1 / (bright + dark), 1 / (variance_s + variance_d)
-    # 1 minus the luminance term, and 1 minus the contrast-structure term. Both are 0 if the images
-    # are equal.
+    # One minus the luminance term, and one minus the contrast-structure term. Both values are 0 if
+    # the images are equal.
     luminance, contrast = 2 * dark * over_mean, 2 * variance_d * over_variance
     dissimilarity = luminance + contrast - luminance * contrast
     by_variance = (1 - luminance).mul_(over_variance).mul_(over_variance).mul_(4)
@@ -179,6 +181,6 @@ def _dissimilarity_and_slope(
     slopes = torch.stack((by_mean, by_s, by_d))
     if mask is not None:
         slopes *= mask
-    # The window is symmetric, so the adjoint operation is the same filter.
+    # The window is symmetric, so the transposed filter of the backward pass is the filter itself.
     of_mean, of_s, of_d = blurred(slopes)
     return dissimilarity, of_mean.addcmul_(sums, of_s).addcmul_(differences, of_d)

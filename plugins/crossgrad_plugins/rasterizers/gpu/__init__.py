@@ -1,1 +1,1 @@
-"""Common parts of rasterizers that draw on a GPU with another package."""
+"""Code for rasterizers that render on a GPU with another package."""

@@ -1,4 +1,4 @@
-"""The number of pixels in which each Gaussian was blended, from gsplat's intersection lists."""
+"""The number of pixels in which each Gaussian was blended, from gsplat's lists."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, Final
@@ -7,17 +7,17 @@ import torch
 from torch import Tensor
 
 _NAMES: Final = ("means2d", "conics", "opacities", "isect_offsets", "flatten_ids")
-#: Number of pixels per call. For each pixel, gsplat lists every Gaussian and needs 24 bytes per
-#: entry.
+#: Number of pixels per call of gsplat. gsplat lists all Gaussians of each pixel and needs 24 bytes
+#: per entry, so a larger number could need too much memory.
 PIXELS: Final = 1 << 19
-#: A number larger than the number of batches of Gaussians in any tile.
+#: A number that is larger than the number of batches of Gaussians in any tile.
 _ALL: Final = 1 << 30
 
 
 def counter(meta: Mapping[str, Any], view: int) -> Callable[[Tensor], Tensor]:
-    """Return the function `Screen.count` of a view.
+    """Return the function `Screen.count` of a rendered view.
 
-    The function keeps the projected data and the tile lists alive.
+    While the function exists, the projected data and the tile lists stay in memory.
 
     Args:
         meta: The metadata that gsplat's `rasterization` returns.
@@ -33,8 +33,8 @@ def counter(meta: Mapping[str, Any], view: int) -> Callable[[Tensor], Tensor]:
         total: Tensor = opacities.new_zeros(opacities.shape[-1], dtype=torch.int64)
         rows = max(1, PIXELS // width)
         for first in range(0, height, rows):
-            # gsplat skips pixels whose transmittance is used up. Set the transmittance of unmarked
-            # pixels to 0, so that gsplat skips them too.
+            # gsplat skips pixels that are already opaque. Set the transmittance of unmarked pixels
+            # to 0, so that gsplat skips these pixels too.
             light = opacities.new_zeros((*opacities.shape[:-1], height, width))
             band = slice(first, first + rows)
             light[view, 0, band] = marked[band].to(light)

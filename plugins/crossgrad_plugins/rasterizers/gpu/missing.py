@@ -1,4 +1,4 @@
-"""Packages and compilers that a rasterizer needs but this machine lacks, and the remedies."""
+"""Packages and compilers that a rasterizer needs but does not find, and how to install them."""
 
 import os
 import re
@@ -13,7 +13,7 @@ import torch
 
 
 def package_missing(package: str, *others: str) -> str | None:
-    """Return why a rasterizer cannot run: a missing package; None if all are installed."""
+    """Return why a rasterizer cannot run because a package is missing, or None."""
     lacks = next((name for name in (package, *others) if find_spec(name) is None), None)
     if lacks is None:
         return None
@@ -24,10 +24,9 @@ def package_missing(package: str, *others: str) -> str | None:
 
 
 def compiler_missing(package: str) -> str | None:
-    """Return why a package cannot compile its kernels at first use.
+    """Return why a package cannot compile its kernels when they are first used.
 
-    The result is None if the package can compile its kernels, or if the kernels are compiled
-    already.
+    The result is None if the package can compile its kernels, or if they are already compiled.
     """
     if is_compiled(package):
         return None
@@ -60,7 +59,7 @@ def compiler_missing(package: str) -> str | None:
 
 
 def is_compiled(package: str) -> bool:
-    """Return True if a package is installed with compiled kernels; the package is not imported."""
+    """Return True if a package is installed with compiled kernels; it is not imported."""
     spec = find_spec(package)
     folders = [] if spec is None else spec.submodule_search_locations or []
     return any(path for folder in folders for path in Path(folder).glob("csrc.*"))
@@ -68,14 +67,14 @@ def is_compiled(package: str) -> bool:
 
 @cache
 def bring_ninja() -> None:
-    """Put ninja from this Python's environment on PATH, so that torch can find it."""
+    """Add ninja from this Python's environment to PATH, so that torch finds it."""
     if shutil.which("ninja") is None:
         folders = [os.environ.get("PATH", ""), str(_own_ninja().parent)]
         os.environ["PATH"] = os.pathsep.join(filter(None, folders))
 
 
 def _own_ninja() -> Path:
-    """Return the path of ninja in the environment of this Python."""
+    """Return the path of ninja in this Python's environment."""
     return Path(sys.executable).parent / "ninja"
 
 
@@ -89,13 +88,13 @@ def find_nvcc() -> Path | None:
 
 
 def _cuda_home() -> str:
-    """Return the only folder in which torch looks for the compiler; empty if it is not set."""
+    """Return the only folder in which torch searches for the compiler; empty if not set."""
     return os.environ.get("CUDA_HOME") or os.environ.get("CUDA_PATH") or ""
 
 
 @cache
 def nvcc_version(nvcc: Path) -> str | None:
-    """Return the CUDA version of a compiler, such as 12.4; None if it cannot be determined."""
+    """Return the CUDA version of a compiler, such as 12.4; None if unknown."""
     try:
         completed = subprocess.run([nvcc, "--version"], capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):

@@ -1,4 +1,4 @@
-"""Renders of other packages inside one autograd function, and the render without Gaussians."""
+"""Renders of other packages inside one autograd function, and renders without Gaussians."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,12 +13,11 @@ from crossgrad_core.plugin import Camera, Gaussians, Render, Screen
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """The results of another package.
+    """The results of another package's rasterizer.
 
     Attributes:
-        outputs: Differentiable results.
-        centers: The tensor whose gradient is the gradient of the loss with respect to the projected
-            means.
+        outputs: Differentiable outputs of the package.
+        centers: The package's tensor of projected means, whose gradient is needed.
     """
 
     outputs: tuple[Tensor, ...]
@@ -27,11 +26,12 @@ class Drawing:
 
 @dataclass(frozen=True, eq=False)
 class Call:
-    """A request for a drawing.
+    """A call of another package's rasterizer.
 
     Attributes:
-        draw: Function that draws, given the tensors.
-        observe: Function that every backward pass calls with `Drawing.centers` and their gradient.
+        draw: Function that renders the given tensors.
+        observe: Function that each backward pass calls with `Drawing.centers` and the gradient of
+            this tensor.
     """
 
     draw: Callable[[Sequence[Tensor]], Drawing]
@@ -39,10 +39,11 @@ class Call:
 
 
 def drawn(call: Call, tensors: Sequence[Tensor]) -> tuple[Tensor, ...]:
-    """Return the outputs of a drawing, differentiable in `tensors`.
+    """Return the outputs of a drawing, with gradients with respect to `tensors`.
 
-    The package's graph is kept inside one autograd node. A hook on `centers` would create a
-    reference cycle with its tensor, and the memory would never be freed.
+    The autograd graph of the package is stored inside one autograd node. A hook on `centers` is not
+    used, because the hook and its tensor would refer to each other, and their memory would never be
+    freed.
     """
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
         outputs: tuple[Tensor, ...] = _Nested.apply(call, *tensors)  # type: ignore[no-untyped-call]
@@ -89,8 +90,9 @@ class _Nested(torch.autograd.Function):
 def empty_render(
     gaussians: Gaussians, camera: Camera, background: Tensor, outputs: frozenset[str]
 ) -> Render:
-    """Return the background with gradients of zero, and screen statistics with zero rows."""
-    # The sum of an empty tensor is 0. It connects every tensor to the graph, as in a normal render.
+    """Return the background, with zero gradients and with screen statistics of zero rows."""
+    # The sum of an empty tensor is 0. Adding it connects every tensor to the graph, as in a normal
+    # render.
     zero = torch.stack([tensor.sum() for tensor in gaussians.floats()]).sum()
     image = background.expand(camera.height, camera.width, 3) + zero
     alpha = torch.zeros_like(image[..., 0])

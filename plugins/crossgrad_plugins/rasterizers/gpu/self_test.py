@@ -1,7 +1,7 @@
-"""A test before a run trains on a GPU: image, loss and gradients of a known scene must be correct.
+"""A test before training on a GPU: image, loss and gradients of a small scene must be correct.
 
-Two failures without any error message are known: a first process on a fresh machine that trained to
-only 14 dB (gsplat issue 872), and renders of uninitialised memory (gsplat issue 1031).
+Two failures are known that give no error message. The first process on a new machine trained to
+only 14 dB (gsplat issue 872), and renders contained uninitialised memory (gsplat issue 1031).
 """
 
 from dataclasses import dataclass
@@ -14,10 +14,10 @@ from torch import Tensor
 from crossgrad_core.plugin import Camera, Gaussians, Rasterizer, UserError
 from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer
 
-#: Maximum difference of a pixel. It occurs if a few Gaussians differ at the edge of their
-#: footprint, by 1/255 each.
+#: Maximum difference of a pixel value. A difference occurs if some Gaussians differ at the edge of
+#: their footprint, by 1/255 each.
 PIXEL: Final = 0.02
-#: Maximum mean difference of pixels, and maximum relative difference of the loss.
+#: Maximum mean difference of pixel values, and maximum relative difference of the loss.
 MEAN: Final = 5e-4
 #: Maximum relative difference of the gradients of a tensor.
 GRADIENT: Final = 2e-2
@@ -28,10 +28,10 @@ _TENSORS: Final = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "
 
 @dataclass(frozen=True)
 class Look:
-    """A render of the known scene, on the CPU.
+    """A render of the test scene, copied to the CPU.
 
     Attributes:
-        image: [H, W, 3].
+        image: [H, W, 3] the rendered image.
         loss: Mean squared difference from a grey ramp.
         gradients: Tensor name -> gradient of the tensor.
     """
@@ -42,13 +42,13 @@ class Look:
 
 
 def self_test(rasterizer: Rasterizer, device: str) -> None:
-    """Render the known scene with RGB colours and with harmonics, and compare with the reference.
+    """Render the test scene with RGB colours and with SH, and compare with the reference.
 
-    Known failures affect the first process and the first call, so the scene is rendered twice.
+    The known failures affect the first process and the first call, so the scene is rendered twice.
 
     Raises:
-        UserError: The rasterizer raises an exception, or its render differs from the render of
-            `torch`.
+        UserError: The rasterizer raises an exception, or its result differs from the result of
+            rasterizer `torch`.
     """
     for harmonics in (False, True):
         expected = look_at(_reference(rasterizer), "cpu", harmonics=harmonics)
@@ -63,7 +63,10 @@ def self_test(rasterizer: Rasterizer, device: str) -> None:
 
 
 def known_scene(device: str, *, harmonics: bool) -> tuple[Gaussians, Camera]:
-    """Return Gaussians of a few pixels, some outside the image, and an off-axis camera."""
+    """Return the test scene: Gaussians of a few pixels, some outside the image, and a camera.
+
+    The principal point of the camera is not in the middle.
+    """
     random = torch.Generator().manual_seed(872)
 
     def uniform(low: float, high: float, *shape: int) -> Tensor:
@@ -87,7 +90,7 @@ def known_scene(device: str, *, harmonics: bool) -> tuple[Gaussians, Camera]:
 
 
 def look_at(rasterizer: Rasterizer, device: str, *, harmonics: bool) -> Look:
-    """Return the image, loss and gradients of the known scene from a rasterizer."""
+    """Return image, loss and gradients of the test scene from a rasterizer."""
     gaussians, camera = known_scene(device, harmonics=harmonics)
     background = torch.tensor([0.2, 0.4, 0.6], device=device)
     image = rasterizer.render(gaussians, camera, background).image
@@ -101,7 +104,7 @@ def look_at(rasterizer: Rasterizer, device: str, *, harmonics: bool) -> Look:
 
 
 def difference(found: Look, expected: Look) -> str:
-    """Return a text about the first difference found; empty if there is none."""
+    """Return a text about the first difference; empty if there is none."""
     error = (found.image - expected.image).abs()
     if not (error.max() < PIXEL and error.mean() < MEAN):
         return (

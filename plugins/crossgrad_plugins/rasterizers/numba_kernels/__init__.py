@@ -1,1 +1,1 @@
-"""Tile-based CPU kernels of the `numba` rasterizer: plain arrays in, plain arrays out."""
+"""CPU kernels of the `numba` rasterizer, which render tile by tile and use only NumPy arrays."""

@@ -16,9 +16,9 @@ Int64 = NDArray[np.int64]
 
 
 def in_lines(count: int) -> Float32:
-    """Return an array of `count` numbers that starts at a cache line of `WIDE` numbers.
+    """Return an array of `count` numbers that is aligned to a cache line of `WIDE` numbers.
 
-    NumPy's own large arrays start 16 bytes after the start of a cache line.
+    Large arrays of NumPy start 16 bytes after the start of a cache line.
     """
     room = np.empty(count + WIDE, np.float32)
     shift = -(room.ctypes.data // room.itemsize) % WIDE
@@ -27,20 +27,22 @@ def in_lines(count: int) -> Float32:
 
 @dataclass(frozen=True)
 class GaussianArrays:
-    """N Gaussians as contiguous float32 arrays; colour is `colors`, or `dc` and `rest`.
+    """N Gaussians as contiguous float32 arrays.
+
+    The colour is given by `colors`, or by `dc` and `rest`.
 
     Attributes:
-        means: [N, 3].
-        quats: [N, 4] wxyz, any norm; a zero quaternion is not drawn.
-        scales: [N, 3] linear.
-        opacities: [N].
-        colors: [N, 3] RGB as rendered.
-        dc: [N, 1, 3] harmonics of degree 0.
-        rest: [N, B - 1, 3] harmonics of higher degrees (B - 1 may be 0).
-        degree: Active degree, 0 to 3.
-        sparse_rows: Fields whose rows `bring` must update before they are read, and whose gradients
-            contain only these rows.
-        bring: Function that updates the given rows [R] int32.
+        means: [N, 3] centres, local frame.
+        quats: [N, 4] rotations wxyz of any length; a Gaussian with a zero quaternion is not drawn.
+        scales: [N, 3] standard deviations along the axes (not their logarithms).
+        opacities: [N] opacities in [0, 1].
+        colors: [N, 3] RGB colours as rendered.
+        dc: [N, 1, 3] SH coefficients of degree 0.
+        rest: [N, B - 1, 3] SH coefficients of higher degrees (B - 1 may be 0).
+        degree: Active SH degree, 0 to 3.
+        sparse_rows: Names of fields with deferred updates. `bring` must update their rows before
+            the rows are read, and their gradients contain only these rows.
+        bring: Function that performs the deferred updates of the given rows [R] int32.
     """
 
     means: Float32
@@ -60,10 +62,10 @@ class CameraArrays:
     """A pinhole camera.
 
     Attributes:
-        viewmat: [4, 4] world to camera.
-        intrinsics: [3, 3] K in pixels, pixel centres at + 0.5.
-        width: Pixels.
-        height: Pixels.
+        viewmat: [4, 4] matrix from world to camera.
+        intrinsics: [3, 3] matrix K in pixels; pixel centres are at + 0.5.
+        width: Width of the image, pixels.
+        height: Height of the image, pixels.
     """
 
     viewmat: NDArray[np.floating]
@@ -74,18 +76,18 @@ class CameraArrays:
 
 @dataclass(frozen=True)
 class DrawOptions:
-    """The adjustable numbers of the rule set, and the optional outputs to compute.
+    """The parameters of the rendering rules, and the optional outputs to compute.
 
     Attributes:
-        max_alpha: Cap of a Gaussian's alpha, below 1.
-        near: Gaussians are drawn if the depth of their centre is larger.
-        dilation: Number that is added to both diagonal entries of the 2-D covariance, px^2.
-        response: The response of a Gaussian in a pixel. `antialiased` lowers opacities to
-            compensate the area that the dilation adds (Mip-Splatting's 2-D filter); `analytic` has
-            no dilation.
+        max_alpha: Maximum alpha of a Gaussian in a pixel, below 1.
+        near: Gaussians are drawn only if the depth of their centre is larger than this.
+        dilation: Variance that is added to both diagonal entries of the 2-D covariance, px^2.
+        response: How alpha depends on the position of the pixel. `antialiased` lowers opacities to
+            compensate for the area that the dilation adds (Mip-Splatting's 2-D filter). `analytic`
+            has no dilation.
         squares: True if a Gaussian touches only the tiles of the published 3-sigma square.
-        depth: True to composite the depth.
-        pixels: True to count the pixels of each Gaussian.
+        depth: True to compute the accumulated depth.
+        pixels: True to count the pixels in which each Gaussian is blended.
     """
 
     max_alpha: float = 0.99
@@ -99,18 +101,20 @@ class DrawOptions:
 
 @dataclass(frozen=True)
 class Projected:
-    """The drawn Gaussians as records.
+    """The drawn Gaussians as records in the layout of `layout`.
 
-    The records of a chunk of Gaussians begin at the start of the chunk.
+    Each chunk of Gaussians has an equal number of places for records, and its records use the first
+    of these places.
 
     Attributes:
-        camera: The view.
-        radii: [N] int32, pixels; 0 if no pixel is touched.
-        records: [N * RECORD] float32.
-        owners: [N] int32, the Gaussian of each record.
-        drawn: [chunks] int64, records per chunk.
-        limits: [N, 2] int32, columns of 16 pixels that each record may touch; None means no limits.
-        rows: [R] int32, the Gaussians that have a record, sorted; None if they are not needed.
+        camera: The camera of the view.
+        radii: [N] int32 radius of each Gaussian, pixels; 0 if it touches no pixel.
+        records: [N * RECORD] float32 records.
+        owners: [N] int32 index of the Gaussian of each record.
+        drawn: [chunks] int64 number of records of each chunk.
+        limits: [N, 2] int32 first and last column of 16 pixels that each record may touch; None for
+            no limits.
+        rows: [R] int32 sorted indices of the Gaussians that have a record; None if not needed.
     """
 
     camera: KernelCamera
@@ -124,13 +128,14 @@ class Projected:
 
 @dataclass(frozen=True)
 class TileLists:
-    """The records that reach each tile, front to back.
+    """For each tile, the records that reach the tile, from front to back.
 
     Attributes:
-        starts: [T + 1] int64, first entry of each tile.
-        entries: [E, 2] int32, records and slots.
-        buckets: [N, BUCKET] int32, the slots of each record.
-        slots: Number of slots.
+        starts: [T + 1] int64 index of the first entry of each tile.
+        entries: [E, 2] int32 record and slot of each entry; a slot is the memory for a record in a
+            tile.
+        buckets: [N, BUCKET] int32 range of the slots of each record.
+        slots: Total number of slots.
     """
 
     starts: Int64
@@ -141,19 +146,20 @@ class TileLists:
 
 @dataclass(frozen=True)
 class Frame:
-    """A rendered view and the data for its backward pass.
+    """A rendered view, and the data for its backward pass.
 
     Attributes:
-        image: [H, W, 3] over the background, not clamped.
-        alpha: [H, W].
-        depth: [H, W] sum of weight times depth, None unless requested.
-        pixels: [N] int32, number of pixels in which each Gaussian was blended, None unless
+        image: [H, W, 3] rendered image over the background, not clamped.
+        alpha: [H, W] accumulated opacity.
+        depth: [H, W] sum of blending weight times depth; None unless requested.
+        pixels: [N] int32 number of pixels in which each Gaussian was blended; None unless
             requested.
-        gaussians: The input Gaussians.
-        options: The input options.
-        projected: Drawn Gaussians.
-        lists: Tile lists.
-        masks: [E] uint64, the patches into which each entry was blended.
+        gaussians: The rendered Gaussians.
+        options: The options of the render.
+        projected: Records of the drawn Gaussians.
+        lists: The records of each tile.
+        masks: [E] uint64 the 4 x 4 pixel patches in which each entry was blended, one bit per
+            patch.
     """
 
     image: Float32
@@ -169,21 +175,22 @@ class Frame:
 
 @dataclass(frozen=True)
 class GaussianGradients:
-    """Gradients of N Gaussians and their screen statistics, float32.
+    """Gradients of N Gaussians, and gradients for screen statistics, float32.
 
     Attributes:
-        means: [N, 3].
-        quats: [N, 4].
-        scales: [N, 3].
-        opacities: [N].
-        colors: [N, 3] with respect to the rendered RGB (after the harmonics are clamped).
-        dc: [N, 1, 3], or [R, 1, 3] for the drawn rows; None without harmonics.
-        rest: [N, B - 1, 3], or [R, B - 1, 3] for the drawn rows; None without harmonics or if not
-            requested.
-        centres: [N, 2] with respect to the projected mean, per pixel.
-        absolute: [N, 2] with respect to the projected mean, summed as absolute values over pixels;
+        means: [N, 3] gradients with respect to the centres.
+        quats: [N, 4] gradients with respect to the quaternions.
+        scales: [N, 3] gradients with respect to the scales.
+        opacities: [N] gradients with respect to the opacities.
+        colors: [N, 3] gradients with respect to the rendered RGB (after SH colours are clamped).
+        dc: [N, 1, 3] gradients, or [R, 1, 3] for only the drawn rows; None without SH.
+        rest: [N, B - 1, 3] gradients, or [R, B - 1, 3] for only the drawn rows; None without SH or
+            if not requested.
+        centres: [N, 2] gradients with respect to the projected means, per pixel.
+        absolute: [N, 2] sums over pixels of the absolute gradients with respect to the projected
+            means; None unless requested.
+        directions: [N, 6, 5] the field `directions` of `crossgrad_core.contract.gaussians.Screen`;
             None unless requested.
-        directions: [N, 6, 5] of `crossgrad_core.contract.gaussians.Screen`; None unless requested.
     """
 
     means: Float32

@@ -1,11 +1,12 @@
-"""Real spherical harmonics up to degree 3, for sixteen directions at once.
+"""Real spherical harmonics (SH) up to degree 3, for sixteen directions at once.
 
-LLVM vectorises branch-free loops over the directions: each component of the directions has a row of
-sixteen numbers. The coefficient kernels need all numbers of one direction side by side; `turned`
-transposes the rows for them.
+LLVM vectorises loops over the directions if they have no branches. Each component of the directions
+therefore has a row of sixteen numbers. The kernels for coefficients need all numbers of one
+direction next to each other, so `turned` transposes the rows.
 
-A Gaussian's coefficients are fifteen triples (red, green, blue), 45 floats. Three vectors contain
-five triples and one spare float each. Basis functions are copied to the lanes of their triples.
+The coefficients of a Gaussian above degree 0 are fifteen triples (red, green, blue), 45 floats.
+They are stored in three vectors of sixteen lanes, each with five triples and one unused float. A
+basis function is copied to the three lanes of its triple.
 """
 
 import math
@@ -16,10 +17,10 @@ from numpy.typing import NDArray
 from crossgrad_core.numerics.simd import WIDE, fma, load_wide, picking, store
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 
-#: Number of floats for x, y, z and the inverse distance of sixteen directions.
+#: Number of floats for x, y, z and the inverse distances of sixteen directions.
 WAYS = 4 * WIDE
-#: Number of basis functions of all degrees, which is equal to the number of lanes of a vector.
-#: Number of floats of the basis functions for sixteen directions.
+#: Number of basis functions of all degrees, which equals the number of lanes of a vector. Number of
+#: floats for the basis functions of sixteen directions.
 BASIS = WIDE
 TABLE = BASIS * WIDE
 _X, _Y, _Z, _INVERSE = 0, WIDE, 2 * WIDE, 3 * WIDE
@@ -33,8 +34,8 @@ _C3_XYZ = 2.890611442640554  # sqrt(105 / (4 pi))
 _C3_XZZ = 0.4570457994644658  # sqrt(21 / (32 pi))
 _C3_ZZZ = 0.3731763325901154  # sqrt(7 / (16 pi))
 _C3_XXZ = 1.445305721320277  # sqrt(105 / (16 pi))
-# Two rows exchange blocks of s lanes. The first group of permutations gives the new first row, and
-# the second group gives the new second row.
+# In each step of the transposition, two rows exchange blocks of lanes. The first group of
+# permutations gives the new first row, and the second group gives the new second row.
 _first_1, _first_2, _first_4, _first_8 = (
     picking([WIDE + lane - s if lane & s else lane for lane in range(WIDE)]) for s in (1, 2, 4, 8)
 )
@@ -47,7 +48,7 @@ _second_1, _second_2, _second_4, _second_8 = (
 def put_way(
     means: NDArray[np.float32], i: int, eye: NDArray[np.float64], ways: NDArray[np.float64], j: int
 ) -> None:
-    """Write the vector from the camera to Gaussian i to number j of the rows of x, y and z."""
+    """Write the vector from the camera to Gaussian i as number j of the rows x, y and z."""
     ways[j + _X] = np.float64(means[i, 0]) - eye[0]
     ways[j + _Y] = np.float64(means[i, 1]) - eye[1]
     ways[j + _Z] = np.float64(means[i, 2]) - eye[2]
@@ -55,7 +56,7 @@ def put_way(
 
 @device
 def normalize(ways: NDArray[np.float64]) -> None:
-    """Normalise sixteen vectors and write their inverse lengths."""
+    """Normalise sixteen vectors, and write their inverse lengths."""
     for j in range(WIDE):
         x, y, z = ways[j + _X], ways[j + _Y], ways[j + _Z]
         inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
@@ -65,7 +66,7 @@ def normalize(ways: NDArray[np.float64]) -> None:
 
 @device
 def basis_of(degree: int, ways: NDArray[np.float64], table: NDArray[np.float32]) -> None:
-    """Write the basis functions of degrees 0 to `degree` of sixteen unit vectors, one row each."""
+    """Write the basis functions of degrees 0 to `degree` for sixteen unit vectors, one row each."""
     for j in range(WIDE):
         table[j] = C0
     if degree < 1:
@@ -104,13 +105,13 @@ def pull_ways(degree: int, v: NDArray[np.float32], ways: NDArray[np.float64]) ->
     """Replace sixteen unit vectors by the gradients of sum(v * basis) with respect to the vectors.
 
     Args:
-        degree: Active degree.
-        v: Gradients of the basis functions of degree 1 and higher, one row each.
-        ways: From `normalize`; x, y and z are replaced.
+        degree: Active SH degree.
+        v: Gradients with respect to the basis functions of degree 1 and higher, one row each.
+        ways: The result of `normalize`; the rows x, y and z are replaced.
     """
     for j in range(WIDE):
         x, y, z = ways[j + _X], ways[j + _Y], ways[j + _Z]
-        # Derivatives with respect to x, y and z, which are treated as independent variables.
+        # These derivatives treat x, y and z as independent variables.
         v_x = v_y = v_z = 0.0
         if degree >= 1:
             v_x, v_y, v_z = -_C1 * v[j + 2 * WIDE], -_C1 * v[j], _C1 * v[j + WIDE]
@@ -174,12 +175,12 @@ def turned(source: NDArray[np.float32], target: NDArray[np.float32]) -> None:
 #: Number of basis functions of degree 1 and higher, and number of floats of their coefficients.
 HIGHER = BASIS - 1
 FLOATS = 3 * HIGHER
-_TRIPLES = 5  # per vector
-_SECOND, _LAST = 3 * _TRIPLES, FLOATS - WIDE  # start of the second vector and of the last vector
+_TRIPLES = 5  # number of coefficient floats per vector
+_SECOND, _LAST = 3 * _TRIPLES, FLOATS - WIDE  # starts of the second and of the last vector
 
 
 def _functions(first: int) -> list[int]:
-    """Return the basis functions of sixteen coefficient floats, from `first` on."""
+    """Return the basis functions for sixteen coefficient floats, starting with float `first`."""
     return [1 + (first + lane) // 3 for lane in range(WIDE)]
 
 
@@ -187,19 +188,18 @@ def _channels(first: int) -> list[int]:
     return [(first + lane) % 3 for lane in range(WIDE)]
 
 
-# The last lane of the first vector belongs to the second vector, and the last lane of the second
-# vector belongs to the third vector. Instead, the third vector has an extra float in its first
-# lane, so that nothing beyond the 45 floats is read or written.
+# The first two vectors read sixteen floats each, so their last lane belongs to the next vector. The
+# third vector starts one float earlier, so that nothing beyond the 45 floats is read or written.
 _spread_first = picking([*_functions(0)[:-1], 0])
 _spread_second = picking([*_functions(_SECOND)[:-1], 0])
 _spread_last = picking(_functions(_LAST))
 _rgb, _rgb_last = picking(_channels(0)), picking(_channels(_LAST))
 _onwards = picking([*range(1, WIDE), 0])
 _six_on = picking([*range(6, WIDE), *range(6)])
-#: Lanes 3 to 5 of the first vector, then lanes 12 to 14 of the second vector.
+#: Lanes 3 to 5 of the first vector, followed by lanes 12 to 14 of the second vector.
 _three_on, _twelve_on = picking([3, 4, 5, *range(3, WIDE)]), picking([28, 29, 30, *range(3, WIDE)])
 #: Select one channel of the five triples of each vector: first from two vectors, then from the
-#: third vector.
+#: third.
 _channel_of_two = [
     picking([*range(c, 15, 3), *range(WIDE + c, WIDE + 15, 3), *([0] * 6)]) for c in range(3)
 ]
@@ -218,14 +218,15 @@ def sum_up(
     at: int,
     colours: NDArray[np.float32],
 ) -> None:
-    """Write the sums of basis functions times coefficients (red, green, blue) to colours[row:].
+    """Write the sums of basis functions times coefficients (red, green, blue) to `colours`.
 
     Args:
-        bases: Basis functions from `row` on.
-        row: First row of `bases` that is read.
-        rest: Coefficients, contiguous; the Gaussian's coefficients begin at float `at`.
-        at: First float of the Gaussian's coefficients in `rest`.
-        colours: Sixteen floats are written; only the first three are used.
+        bases: Basis functions, starting with number `row`.
+        row: Index of the first number that is read from `bases`.
+        rest: SH coefficients, contiguous.
+        at: Index of the first float of the Gaussian's coefficients in `rest`.
+        colours: Output from index `row` on; sixteen floats are written, and only the first three
+            have a meaning.
     """
     basis = load_wide(bases, row)
     last = load_wide(rest, at + _LAST)
@@ -246,18 +247,18 @@ def spread(
     v_rest: NDArray[np.float32],
     to: int,
 ) -> None:
-    """Write the gradients of the coefficients.
+    """Write the gradients with respect to the coefficients.
 
     Args:
-        bases: Basis functions from `row` on.
-        row: First row of `bases` and `v_rgb` that is read.
-        v_rgb: The gradients of the colour, from `row` on.
-        v_rest: Written from float `to` on.
-        to: First float of `v_rest` that is written.
+        bases: Basis functions, starting with number `row`.
+        row: Index of the first number that is read from `bases` and `v_rgb`.
+        v_rgb: The gradients with respect to the colour, starting with number `row`.
+        v_rest: Output, written from float `to` on.
+        to: Index of the first float of `v_rest` that is written.
     """
     basis, three = load_wide(bases, row), load_wide(v_rgb, row)
     rgb, rgb_last = _rgb(three, three), _rgb_last(three, three)
-    # Keep this order, because each vector writes one spare float that the next vector overwrites.
+    # Keep this order, because each vector writes one unused float that the next vector overwrites.
     store(v_rest, to, _spread_first(basis, basis) * rgb)
     store(v_rest, to + _SECOND, _spread_second(basis, basis) * rgb)
     store(v_rest, to + _LAST, _spread_last(basis, basis) * rgb_last)
@@ -271,14 +272,14 @@ def rest_basis_gradients(
     at: int,
     v_bases: NDArray[np.float32],
 ) -> None:
-    """Write the gradients of the basis functions of degree 1 and higher.
+    """Write the gradients with respect to the basis functions of degree 1 and higher.
 
     Args:
-        v_rgb: The gradients of the colour, from `row` on.
-        row: First row of `v_rgb` that is read, and of `v_bases` that is written.
-        rest: Coefficients.
-        at: First float of the coefficients.
-        v_bases: Written from `row` on: fifteen numbers and one unused number.
+        v_rgb: The gradients with respect to the colour, starting with number `row`.
+        row: Index of the first number that is read from `v_rgb` and written to `v_bases`.
+        rest: SH coefficients, contiguous.
+        at: Index of the first float of the Gaussian's coefficients in `rest`.
+        v_bases: Output from `row` on: fifteen numbers and one unused number.
     """
     three = load_wide(v_rgb, row)
     rgb, rgb_last = _rgb(three, three), _rgb_last(three, three)

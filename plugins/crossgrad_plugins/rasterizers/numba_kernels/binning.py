@@ -1,7 +1,7 @@
-"""Lists of the records that reach each tile, front to back.
+"""Lists of the records that reach each tile, from front to back.
 
-First the tiles of each record are found, in memory order, and stored in consecutive slots. Then the
-tile lists are filled in depth order.
+First the tiles of each record are found and stored in consecutive slots, in the order of the
+records in memory. Then the tile lists are filled in the order of depth.
 """
 
 import numpy as np
@@ -45,22 +45,22 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 )
 from crossgrad_plugins.rasterizers.numba_kernels.sorting import order_by_depth
 
-#: The chunks are counted in this number of parts. The number is fixed, so that results do not
-#: depend on the number of threads.
+#: Number of parts into which the chunks are divided for counting. The number is constant, so that
+#: results do not depend on the number of threads.
 PARTS = 16
 
-#: Number of records whose spans are computed before the first of their tiles is written. With
-#: smaller groups, loops of unknown length would make the processor wait for the square roots of
-#: each record.
+#: Number of records whose spans of tiles are computed before the first of these tiles is written.
+#: In a group of records, the processor computes square roots in parallel; one record at a time, it
+#: would wait for each of them.
 _GROUP = 32
 
-#: Start positions of the values of the ellipses in the buffer of a group.
+#: Positions of the values of the ellipses in the buffer of a group.
 _OF_SLOPE, _OF_DECAY, _OF_WIDTH, _OF_BUDGET, _OF_EXTENT, _OF_TILT = range(0, 6 * _GROUP, _GROUP)
 
-#: Memory is prefetched this many records ahead: first for the slot numbers, then for the slots.
+#: Memory is prefetched for records this far ahead: first the slot numbers, then the slots.
 _FAR, _NEAR = 32, 16
 
-#: Data of a record that are needed to fill the lists.
+#: Fields of a record that are needed to fill the lists.
 FIRST_SLOT, SLOTS, FIRST_ROW, LAST_ROW = 0, 1, 2, 3
 BUCKET = 4
 
@@ -72,16 +72,17 @@ def collect(
     depths: NDArray[np.float64],
     buckets: NDArray[np.int32],
 ) -> tuple[NDArray[np.int32], NDArray[np.float64], int]:
-    """Remove the gaps between chunks.
+    """Copy the records of all chunks together, without gaps between chunks.
 
     Args:
-        drawn: [chunks] records per chunk.
-        room: [chunks] slots per chunk.
+        drawn: [chunks] number of records of each chunk.
+        room: [chunks] number of slots of each chunk.
         depths: [N] depth of each record.
-        buckets: [N, BUCKET] per record; the first slots become global slot numbers.
+        buckets: [N, BUCKET] range of slots per record; the first slots are changed to global slot
+            numbers.
 
     Returns:
-        The drawn records [M], their depths [M] and the number of slots.
+        The drawn records [M], their depths [M], and the total number of slots.
     """
     total = drawn.sum()
     items = np.empty(total, np.int32)
@@ -100,7 +101,7 @@ def collect(
 
 @device
 def _tile(position: Lanes, size: int) -> Lanes:
-    """Return the tile that contains a pixel."""
+    """Return the index of the tile that contains a pixel."""
     return round_down(position * splat(np.float32(1.0 / size)))
 
 
@@ -108,9 +109,9 @@ def _tile(position: Lanes, size: int) -> Lanes:
 def _ellipses(
     first: int, last: int, records: NDArray[np.float32], ellipses: NDArray[np.float32]
 ) -> None:
-    """Write the ellipse parameters of a group of records, which every row of tiles uses.
+    """Write the ellipse parameters of a group of records; every row of tiles uses them.
 
-    Square roots and quotients are computed for eight records at once.
+    Square roots and quotients are computed for eight records at the same time.
     """
     for j in range(first, last):
         k, at = j - first, j * RECORD
@@ -121,7 +122,8 @@ def _ellipses(
     for k in range(0, last - first, LANES):
         slope, row_decay = load(ellipses, _OF_SLOPE + k), load(ellipses, _OF_DECAY + k)
         width, budget = load(ellipses, _OF_WIDTH + k), load(ellipses, _OF_BUDGET + k)
-        # The rightmost point is at the maximum of slope dy + sqrt(width (budget - row_decay dy^2)).
+        # The rightmost point maximises slope dy + sqrt(width (budget - row_decay dy^2)), with the
+        # offset dy from the mean.
         extent_y = square_root(budget / row_decay)
         tilt = slope * extent_y / square_root(fma(row_decay, width, slope * slope))
         store(ellipses, _OF_EXTENT + k, extent_y)
@@ -139,16 +141,16 @@ def _spans(
     ends: NDArray[np.float32],
     lane: int,
 ) -> None:
-    """Write the first and last reached tile in eight rows of tiles (first > last means none).
+    """Write the first and last reached tile in eight rows of tiles; first > last means none.
 
-    The record at `at` belongs to ellipse k of the group.
+    The record `at` has ellipse number k of the group.
 
-    The ends of an ellipse's rows form concave curves. The extremes between two rows of pixels are
-    at the ellipse's leftmost and rightmost point, or in the row nearest to that point.
+    The ends of an ellipse in its rows form concave curves. Within a row of tiles, the extreme is at
+    the ellipse's leftmost or rightmost point, or in the pixel row nearest to this point.
     """
     zero = splat(np.float32(0.0))
     half = splat(np.float32(0.5))
-    # In this function, pixel centres are at whole numbers.
+    # In this function, pixel centres have whole-number coordinates.
     u = broadcast(records, at + U_WHOLE) + (broadcast(records, at + U_PART) - half)
     v = broadcast(records, at + V_WHOLE) + (broadcast(records, at + V_PART) - half)
     slope = broadcast(ellipses, _OF_SLOPE + k)
@@ -189,10 +191,11 @@ def _find(
 ) -> int:
     """Write the tiles that record j (number k of its group) reaches to slots, and count them.
 
-    The spans of the first eight rows of tiles are already computed, unless the whole box is used.
+    The spans of the first eight rows of tiles must already be computed, unless the whole box is
+    used.
 
     Returns:
-        The number of tiles.
+        The number of reached tiles.
     """
     lane = k * LANES
     left, right = np.float32(boxes[j, 0]), np.float32(boxes[j, 1] - 1)
@@ -208,8 +211,8 @@ def _find(
             if begin > end:
                 continue
             tile = (block + row) * tile_columns + begin
-            # Most rows have one or two tiles, and the processor cannot predict which. Both cases
-            # therefore share branch-free code.
+            # Most rows have one or two tiles, and the processor cannot predict how many. One and
+            # two tiles are therefore written by code without branches.
             more = np.intp(end > begin)
             tile_of_slot[slot] = tile
             tile_of_slot[slot + more] = tile + more
@@ -237,20 +240,20 @@ def find_tiles(
     depths: NDArray[np.float64],
     order: NDArray[np.int32],
 ) -> None:
-    """Find the tiles that each footprint reaches; a parallel job sorts the records by depth.
+    """Find the tiles that each record reaches; at the same time, one job sorts records by depth.
 
     Args:
-        jobs: From `share`.
-        tile_columns: Tiles in a row of tiles.
-        records: Flat records.
-        boxes: [N, 4] tile boxes per record.
-        boxed: True to use all tiles of the boxes (records of the analytic response).
-        drawn: [chunks] records per chunk.
-        buckets: [N, BUCKET] per record; completed here.
-        tile_of_slot: [slots] written.
-        counts: [PARTS, T] written: entries per part and tile; zero before.
+        jobs: Work queue from `share`.
+        tile_columns: Number of tiles in a row.
+        records: The records, flat.
+        boxes: [N, 4] box of tiles per record.
+        boxed: True to use all tiles of each box, as for records of the analytic response.
+        drawn: [chunks] number of records of each chunk.
+        buckets: [N, BUCKET] range of slots per record; this function completes it.
+        tile_of_slot: [slots] output: tile of each slot.
+        counts: [PARTS, T] output: number of entries per part and tile; must be zero at the start.
         depths: [M] depths of the drawn records.
-        order: [M] the drawn records; sorted by depth in place.
+        order: [M] indices of the drawn records; they are sorted by depth in place.
     """
     chunks = drawn.shape[0]
     ellipses = np.zeros(6 * _GROUP, np.float32)
@@ -258,7 +261,7 @@ def find_tiles(
     ends = np.empty(_GROUP * LANES, np.float32)
     job = next_job(jobs, PARTS + 1)
     while job <= PARTS:
-        # Sorting is a single job. It takes the longest, so it starts first.
+        # Sorting is one job. It starts first, because it takes the longest time.
         if job == 0:
             order[:] = order_by_depth(depths, order)
             job = next_job(jobs, PARTS + 1)
@@ -300,9 +303,9 @@ def start_tiles(
     """Return the first entry of each tile [T + 1], and divide the rows of tiles into bands.
 
     Args:
-        counts: [PARTS, T] entries per part and tile.
-        tile_columns: Tiles in a row of tiles.
-        bands: [bands + 1] written: first row of tiles of each band; bands have about equal numbers
+        counts: [PARTS, T] number of entries per part and tile.
+        tile_columns: Number of tiles in a row.
+        bands: [bands + 1] output: first row of tiles of each band; bands have nearly equal numbers
             of entries.
     """
     tiles = counts.shape[1]
@@ -331,17 +334,17 @@ def fill_tiles(
     starts: NDArray[np.int64],
     entries: NDArray[np.int32],
 ) -> None:
-    """Write the tile lists; each job writes one band of rows of tiles.
+    """Write the tile lists; each job writes one band, a group of rows of tiles.
 
     Args:
-        jobs: From `share`.
-        order: [M] records front to back.
-        tile_columns: Tiles in a row of tiles.
+        jobs: Work queue from `share`.
+        order: [M] indices of records, from front to back.
+        tile_columns: Number of tiles in a row.
         bands: [bands + 1] first row of tiles of each band.
-        buckets: [N, BUCKET] per record.
-        tile_of_slot: [slots] from `find_tiles`.
-        starts: [T + 1] first entry of each tile.
-        entries: [E, 2] written: the record and the slot of each entry, tile by tile, front to back.
+        buckets: [N, BUCKET] range of slots per record.
+        tile_of_slot: [slots] tile of each slot, from `find_tiles`.
+        starts: [T + 1] index of the first entry of each tile.
+        entries: [E, 2] output: record and slot of each entry, tile by tile, from front to back.
     """
     count = order.shape[0]
     last = bands.shape[0] - 1

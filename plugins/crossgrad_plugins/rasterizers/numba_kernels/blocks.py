@@ -1,7 +1,8 @@
-"""Blocks: rows of BLOCK float64 numbers in one flat vector; number k of each row is for Gaussian k.
+"""Blocks of float64 numbers in one flat vector.
 
-LLVM vectorises branch-free loops over k only if it knows that rows do not overlap. Therefore a
-block is one vector with rows at constant distances.
+A block has rows of BLOCK numbers, and number k of each row belongs to Gaussian k. LLVM vectorises
+loops over k only if they have no branches and if it knows that rows do not overlap. A block is
+therefore one vector, whose rows start at constant distances.
 """
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import Row, Triple
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 
-#: Number of Gaussians in a block. CHUNK is a multiple of this number.
+#: Number of Gaussians in a block. CHUNK must be a multiple of this number.
 BLOCK = 128
 
 

@@ -1,7 +1,7 @@
 """The elliptical weighted average (EWA) projection of one Gaussian, and its gradients.
 
-All values are float64: the speed of these kernels is limited by memory, and thin Gaussians need the
-precision.
+All values are float64. These kernels are limited by memory and not by arithmetic, and thin
+Gaussians need the precision.
 """
 
 import math
@@ -14,7 +14,8 @@ from crossgrad_core.numerics.raster_constants import JACOBIAN_MARGIN
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 from crossgrad_plugins.rasterizers.numba_kernels.tiles.analytic import SIGMA_FLOOR
 
-#: In px^4. The antialiased response removes footprints whose determinant is at most this value.
+#: Limit in px^4. The antialiased response removes footprints whose determinant is at most this
+#: limit.
 LEAST_DET = 1e-6
 Triple = tuple[float, float, float]
 Row = tuple[float, float, float, float]
@@ -22,14 +23,14 @@ Pose = tuple[Row, Row, Row]
 
 
 class KernelCamera(NamedTuple):
-    """A camera in the format of the kernels (all float64).
+    """A camera in the form that kernels need (all values float64).
 
     Attributes:
-        pose: [3, 4] world to camera.
-        fx, fy, cx, cy: Pixels.
-        left, right, top, bottom: Bounds of x/z and y/z for the Jacobian.
-        width, height: Pixels.
-        eye: [3] camera centre, world.
+        pose: [3, 4] matrix from world to camera.
+        fx, fy, cx, cy: Focal lengths and principal point, pixels.
+        left, right, top, bottom: Bounds of x/z and y/z in the Jacobian.
+        width, height: Size of the image, pixels.
+        eye: [3] camera centre in the world.
     """
 
     pose: NDArray[np.float64]
@@ -71,7 +72,10 @@ def pinhole(
 
 @device
 def in_registers(pose: NDArray[np.float64]) -> Pose:
-    """Return a [3, 4] matrix as scalars, which loops that write to memory need not reload."""
+    """Return a [3, 4] matrix as scalars.
+
+    Loops that write to memory then need not read the matrix again.
+    """
     return (
         (pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]),
         (pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]),
@@ -81,7 +85,7 @@ def in_registers(pose: NDArray[np.float64]) -> Pose:
 
 @device
 def to_camera(pose: Pose, point: Triple) -> Triple:
-    """Return a point in the camera's frame."""
+    """Return a point in the coordinates of the camera."""
     x, y, z = point
     return (
         pose[0][0] * x + pose[0][1] * y + pose[0][2] * z + pose[0][3],
@@ -92,7 +96,7 @@ def to_camera(pose: Pose, point: Triple) -> Triple:
 
 @device
 def unit_quaternion(quat: Row) -> tuple[Row, float]:
-    """Return the quaternion wxyz at unit length, and its inverse norm (0 for a zero quaternion)."""
+    """Return a quaternion wxyz of length 1, and the input's inverse length (0 for zero)."""
     w, x, y, z = quat
     square = w * w + x * x + y * y + z * z
     inverse = 1.0 / math.sqrt(square) if square > 0.0 else 0.0
@@ -114,7 +118,7 @@ def rotation(unit: Row) -> tuple[Triple, Triple, Triple]:
 def jacobian_rows(
     camera: KernelCamera, pose: Pose, inverse_z: float, slope_x: float, slope_y: float
 ) -> tuple[Triple, Triple]:
-    """Return both rows of (Jacobian of the projection) x (world-to-camera rotation)."""
+    """Return both rows of (Jacobian of the projection) x (rotation from world to camera)."""
     a, b = camera.fx * inverse_z, camera.fy * inverse_z
     return (
         (
@@ -144,7 +148,7 @@ def clamped(value: float, low: float, high: float) -> float:
 
 @device
 def in_axes(row: Triple, columns: tuple[Triple, Triple, Triple]) -> Triple:
-    """Return one row of (projection x rotation): the images of the Gaussian's unit axes."""
+    """Return one row of (projection x rotation): the projections of the Gaussian's unit axes."""
     return dot(row, columns[0]), dot(row, columns[1]), dot(row, columns[2])
 
 
@@ -156,7 +160,10 @@ def times(a: Triple, b: Triple) -> Triple:
 
 @device
 def opacity_factor(raw_det: float, det: float) -> float:
-    """Return the factor that keeps the energy after dilation (Mip-Splatting); 0 means removed."""
+    """Return the factor that compensates opacity for dilation (Mip-Splatting).
+
+    The factor 0 means that the Gaussian is removed.
+    """
     if not (raw_det > LEAST_DET and det > LEAST_DET):
         return 0.0
     return math.sqrt(raw_det / (det + LEAST_DET) + LEAST_DET)
@@ -168,8 +175,8 @@ def covariance(
 ) -> tuple[float, float, float, float, float]:
     """Return A, B, C and the determinant of [m; n] [m; n]^T + dilation I, and the opacity factor.
 
-    The determinant is a sum of squares (Cauchy-Binet), so that no precision is lost by
-    cancellation.
+    The determinant is computed as a sum of squares (Cauchy-Binet), so that cancellation cannot lose
+    precision.
     """
     raw_a, b, raw_c = dot(m, m), dot(m, n), dot(n, n)
     raw_det = (
@@ -184,7 +191,7 @@ def covariance(
 
 @device
 def combined(a: Triple, p: float, b: Triple, q: float) -> Triple:
-    """Return a p + b q."""
+    """Return a p + b q for two vectors p and q."""
     return a[0] * p + b[0] * q, a[1] * p + b[1] * q, a[2] * p + b[2] * q
 
 
@@ -192,7 +199,10 @@ def combined(a: Triple, p: float, b: Triple, q: float) -> Triple:
 def covariance_gradient(
     b: float, c: float, det: float, sum_dd: float, sum_dy: float, sum_yy: float
 ) -> Triple:
-    """Return the gradients of A, B (as one number) and C of the dilated covariance."""
+    """Return the gradients with respect to A, B and C of the dilated covariance.
+
+    B stands for both off-diagonal entries.
+    """
     inverse_c = 1.0 / c
     slope, inverse_variance = b * inverse_c, c / det
     v_variance = 0.5 * inverse_variance * inverse_variance * sum_dd
@@ -209,10 +219,11 @@ def covariance_gradient(
 def factor_gradient(
     m: Triple, n: Triple, dilation: float, det: float, factor: float, v_log_factor: float
 ) -> Triple:
-    """Return the contribution of the antialiasing factor to the gradients of A, B and C."""
+    """Return the part of the gradients with respect to A, B and C from the antialiasing factor."""
     a, b, c = dot(m, m), dot(m, n), dot(n, n)
     raw_det = det - dilation * (a + c) - dilation * dilation
-    # factor^2 = raw_det / (det + e) + e, so d(log factor) = d(factor^2) / (2 factor^2)
+    # With e = LEAST_DET, factor^2 = raw_det / (det + e) + e, so d(log factor) = d(factor^2) / (2
+    # factor^2)
     v_square = 0.5 * v_log_factor / (factor * factor)
     v_raw_det = v_square / (det + LEAST_DET)
     v_det = -v_raw_det * raw_det / (det + LEAST_DET)
@@ -233,11 +244,11 @@ def axes_gradient(
     sum_sigma_2: float,
     v_angle: float,
 ) -> Triple:
-    """Return the gradients of A, B (as one number) and C of the analytic response.
+    """Return the gradients with respect to A, B and C for the analytic response.
 
-    The sums are sums over the gradients with respect to the logarithms of the standard deviations.
-    A standard deviation at its lower bound has no gradient, and the axes of a round Gaussian do not
-    rotate.
+    B stands for both off-diagonal entries. The input sums are gradients with respect to the
+    logarithms of the standard deviations. A standard deviation at its lower bound has no gradient.
+    The axes of a round Gaussian have no gradient for their rotation.
     """
     floor = SIGMA_FLOOR * SIGMA_FLOOR
     v_1 = 0.5 * sum_sigma_1 / variance_1 if variance_1 > floor else 0.0
@@ -254,7 +265,7 @@ def axes_gradient(
 
 @device
 def turn_gradient(q: Row, inverse_norm: float, x: Triple, y: Triple, z: Triple) -> Row:
-    """Return the gradient of a quaternion from the gradients of its matrix' columns."""
+    """Return the gradient with respect to a quaternion from the gradients of its matrix columns."""
     w, a, b, c = q
     v_w = 2.0 * (a * (y[2] - z[1]) + b * (z[0] - x[2]) + c * (x[1] - y[0]))
     v_a = 2.0 * (w * (y[2] - z[1]) + b * (x[1] + y[0]) + c * (x[2] + z[0])) - 4.0 * a * (
@@ -277,7 +288,7 @@ def turn_gradient(q: Row, inverse_norm: float, x: Triple, y: Triple, z: Triple) 
 
 @device
 def weighted_sum(columns: tuple[Triple, Triple, Triple], weights: Triple) -> Triple:
-    """Return the sum of the three columns times their weights."""
+    """Return the sum of three columns, each times its weight."""
     a, b, c = columns
     p, q, r = weights
     return (

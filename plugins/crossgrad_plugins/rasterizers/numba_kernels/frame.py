@@ -97,13 +97,13 @@ def backward(
     """Return the gradients of sum(image * v_image) + sum(alpha * v_alpha) + sum(depth * v_depth).
 
     Args:
-        frame: Frame that `forward` returned; it contains a depth if `v_depth` is given.
-        v_image: [H, W, 3].
-        v_alpha: [H, W] or None.
-        v_depth: [H, W] or None.
-        absolute: True to compute the absolute gradients of the projected means.
-        directions: True to bin the directions of the pixels' gradients.
-        harmonics: True to compute the gradients of the harmonics of higher degrees.
+        frame: The frame that `forward` returned; it must contain a depth if `v_depth` is given.
+        v_image: [H, W, 3] gradient with respect to the image.
+        v_alpha: [H, W] gradient with respect to the accumulated opacity, or None.
+        v_depth: [H, W] gradient with respect to the depth, or None.
+        absolute: True to compute the absolute gradients with respect to the projected means.
+        directions: True to compute the directions of the pixels' gradients.
+        harmonics: True to compute the gradients with respect to SH coefficients of higher degrees.
     """
     gaussians, options, projected, lists = (
         frame.gaussians,
@@ -138,8 +138,8 @@ def backward(
         quats=np.empty((count, 4), np.float32),
         scales=np.empty((count, 3), np.float32),
         opacities=np.empty(count, np.float32),
-        # With spherical harmonics, the colour gradients of Gaussians that were not rendered are
-        # never read, so they need no zeros.
+        # With spherical harmonics, only the colour gradients of rendered Gaussians are read, so the
+        # others need no zeros.
         colors=(np.zeros if gaussians.dc is None else np.empty)((count, 3), np.float32),
         dc=_room(frame, "sh_dc", gaussians.dc),
         rest=_room(frame, "sh_rest", gaussians.rest) if harmonics else None,
@@ -208,7 +208,7 @@ def _directions(
     v_depth: Float32 | None,
     written: NDArray[np.uint8],
 ) -> Float32:
-    """Return the directions of the pixels' gradients [N, BINS, FIELDS], in a separate pass."""
+    """Return the directions [N, BINS, FIELDS] of the pixels' gradients, from a separate pass."""
     gaussians, projected, lists = frame.gaussians, frame.projected, frame.lists
     analytic = _analytic(frame.options)
     axes = np.empty(2 * gaussians.means.shape[0], np.float32)
@@ -261,14 +261,14 @@ def marked_pixels(
     options: DrawOptions,
     marked: NDArray[np.uint8],
 ) -> Int32:
-    """Return the number of marked pixels of a view in which each Gaussian was blended, [N].
+    """Return for each Gaussian [N] the number of marked pixels in which it was blended.
 
     Args:
-        projected: Field of the view's `Frame`.
-        lists: Field of the view's `Frame`.
-        masks: Field of the view's `Frame`.
-        options: Field of the view's `Frame`.
-        marked: [H, W], non-zero if a pixel is marked.
+        projected: The field of the view's `Frame`.
+        lists: The field of the view's `Frame`.
+        masks: The field of the view's `Frame`.
+        options: The field of the view's `Frame`.
+        marked: [H, W] non-zero for marked pixels.
     """
     counts = np.zeros(lists.slots, np.int32)
     parallel(
@@ -286,17 +286,17 @@ def marked_pixels(
 
 
 def _pixels(projected: Projected, lists: TileLists, counts: Int32) -> Int32:
-    """Return the sums of the counts [slots] per Gaussian, [N]."""
+    """Return [N] the sum of the slots' counts for each Gaussian."""
     pixels = np.zeros_like(projected.radii)
     parallel(count_pixels, projected.drawn, projected.owners, lists.buckets, counts, pixels)
     return pixels
 
 
 def _analytic(options: DrawOptions) -> Float32 | None:
-    """Return an array if the response is analytic, else None; kernels are specialised by this type.
+    """Return an array if the response is analytic, else None.
 
-    The content of the array is not used. Kernels of the analytic response are compiled at first
-    use.
+    Numba compiles separate kernels for the two types. The content of the array is not used. Kernels
+    of the analytic response are compiled when they are first used.
     """
     return np.empty(0, np.float32) if options.response == "analytic" else None
 

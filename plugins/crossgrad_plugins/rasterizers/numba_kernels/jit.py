@@ -1,7 +1,7 @@
-"""Compilation of the kernels of this package, with IEEE arithmetic in the order of the source code.
+"""Compilation of the kernels of this package, with exact IEEE arithmetic.
 
-Without fast-math, results do not depend on choices of the compiler. Checks for infinities and NaN
-give correct results.
+Without fast-math, results do not depend on optimisations of the compiler. Tests for infinity and
+NaN also work correctly.
 """
 
 from collections.abc import Callable
@@ -14,10 +14,10 @@ R = TypeVar("R")
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile an entry point; the result is cached on disk."""
+    """Compile a kernel that Python calls; the compiled code is cached on disk."""
     return compiled(function)
 
 
 def device(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a function that kernels call; the function becomes part of the calling kernel."""
+    """Compile a function that only kernels call; it becomes part of the calling kernel."""
     return inlined(function)

@@ -1,4 +1,4 @@
-"""The projected longest axis of each drawn Gaussian, and sums along it."""
+"""The projected longest axis of each drawn Gaussian, and sums along this axis."""
 
 import math
 
@@ -21,10 +21,10 @@ from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
 from crossgrad_plugins.rasterizers.numba_kernels.layout import CHUNK
 from crossgrad_plugins.rasterizers.numba_kernels.tiles.directions import BINS, FIELDS, SUMS
 
-#: An axis that is shorter than this on the image (pixels) points along the viewing direction, so it
-#: has no direction on the image.
+#: A projected axis that is shorter than this (pixels) points along the viewing direction, so its
+#: direction in the image is undefined.
 SHORTEST = 1e-6
-#: Unit of the gradients that are computed from plain records.
+#: Unit of the gradients from records of the plain response.
 _PLAIN_UNIT = 2.0 * math.log(2.0)
 
 
@@ -35,7 +35,7 @@ def _axis(
     quat: NDArray[np.float32],
     scale: NDArray[np.float32],
 ) -> tuple[float, float]:
-    """Return a / |a|^2; a is the projected longest axis (one standard deviation), px."""
+    """Return a / |a|^2, where a is the projected longest axis (one standard deviation), pixels."""
     pose = in_registers(camera.pose)
     x, y, z = to_camera(pose, (np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])))
     unit, _ = unit_quaternion(
@@ -68,18 +68,19 @@ def longest_axes(
     owners: NDArray[np.int32],
     axes: NDArray[np.float32],
 ) -> None:
-    """Project the longest axis of every record.
+    """Write the projected longest axis of every record.
 
     Args:
-        jobs: From `share`.
+        jobs: Work queue from `share`.
         camera: The camera.
-        means: [N, 3].
-        quats: [N, 4].
-        scales: [N, 3].
-        drawn: [chunks] from `project`.
-        owners: [N] from `project`.
-        axes: [2 N] flat, written per record: a / |a|^2, where a is the projected axis, one standard
-            deviation long, in pixels; 0 if the axis is seen end on.
+        means: [N, 3] centres.
+        quats: [N, 4] rotations wxyz.
+        scales: [N, 3] standard deviations.
+        drawn: [chunks] number of records of each chunk, from `project`.
+        owners: [N] Gaussian of each record, from `project`.
+        axes: [2 N] output, flat, per record: a / |a|^2, where a is the projected longest axis, one
+            standard deviation long, in pixels. It is 0 if the axis points along the viewing
+            direction.
     """
     chunks = drawn.shape[0]
     chunk = next_job(jobs, chunks)
@@ -101,17 +102,18 @@ def add_directions(
     found: NDArray[np.float32],
     directions: NDArray[np.float32],
 ) -> None:
-    """Sum each Gaussian's slots in their order.
+    """Sum the slots of each Gaussian in their order.
 
     Args:
-        jobs: From `share`.
+        jobs: Work queue from `share`.
         analytic: True if the response is analytic.
-        drawn: [chunks] from `project`.
-        owners: [N] from `project`.
-        buckets: [N, BUCKET] from binning.
-        written: [slots] from `differentiate`.
-        found: [slots * SUMS] from `bin_directions`.
-        directions: [N, BINS, FIELDS] written for Gaussians with gradients, zero before.
+        drawn: [chunks] number of records of each chunk, from `project`.
+        owners: [N] Gaussian of each record, from `project`.
+        buckets: [N, BUCKET] range of slots per record.
+        written: [slots] flags from `differentiate`: 1 for slots with sums.
+        found: [slots * SUMS] sums from `bin_directions`.
+        directions: [N, BINS, FIELDS] output for Gaussians with gradients; must be zero at the
+            start.
     """
     unit = 1.0 if analytic else _PLAIN_UNIT
     total = np.empty(SUMS, np.float32)

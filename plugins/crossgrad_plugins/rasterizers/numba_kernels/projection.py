@@ -52,10 +52,10 @@ from crossgrad_plugins.rasterizers.numba_kernels.records import (
     write_plain,
 )
 
-#: Distance in standard deviations at which the alpha of a Gaussian with opacity 1 falls below the
-#: threshold. 1 % is added for poses that are not exactly rigid.
+#: Distance, in standard deviations, at which the alpha of a Gaussian with opacity 1 is below the
+#: threshold. 1 % is added, because poses may not be exactly rigid.
 _SIGMAS = 1.01 * math.sqrt(-2.0 * math.log(ALPHA_THRESHOLD))
-#: Factor for depth comparisons, because the same depth may be rounded differently here.
+#: Tolerance factor for comparisons of depths, which other code rounds differently.
 _NEARER = 1.0 - 1e-9
 
 
@@ -87,9 +87,10 @@ def _may_be_drawn(
 ) -> None:
     """Set `flags` for each of `size` Gaussians that may touch a pixel.
 
-    The loop has no branches, so it is vectorised. A footprint ends sqrt(2 log(255 opacity))
-    standard deviations from the mean. The projected standard deviation is at most the projection of
-    a ball with the radius of the largest scale. All values are multiplied by the depth.
+    The loop has no branches, so that LLVM vectorises it. The edge of a footprint is sqrt(2 log(255
+    opacity)) standard deviations from the mean. The projected standard deviation is at most as
+    large as the projection of a ball whose radius is the largest scale. Both sides of the
+    comparisons are multiplied by the depth, to avoid divisions.
     """
     pose = in_registers(camera.pose)
     steep_x = max(abs(camera.left), abs(camera.right))
@@ -108,8 +109,8 @@ def _may_be_drawn(
         inside = (off_x <= (half_x + spare) * z + ball_x * ball) & (
             off_y <= (half_y + spare) * z + ball_y * ball
         )
-        # A Gaussian with an opacity above 1 reaches farther, so it is kept even if it is outside
-        # these limits.
+        # A Gaussian with an opacity above 1 has a wider footprint, so it is kept even outside these
+        # limits.
         flags[k] = (z > near * _NEARER) & (opacity >= ALPHA_THRESHOLD) & (inside | (opacity > 1.0))
 
 
@@ -127,7 +128,7 @@ def _picked(
 ) -> int:
     """Copy the Gaussians of a block that may be drawn to consecutive rows; return their number.
 
-    `chosen` receives their indices; `picked` receives their means, quaternions, scales and
+    `chosen` gets the indices of the Gaussians; `picked` gets their means, quaternions, scales and
     opacities.
     """
     count = 0
@@ -157,9 +158,9 @@ def _project_block(
     scales: NDArray[np.float32],
     projected: NDArray[np.float64],
 ) -> None:
-    """Project the first `count` Gaussians, visible or not, in a branch-free, vectorised loop.
+    """Project the first `count` Gaussians, visible or not, in a vectorised loop without branches.
 
-    All arrays are flat, because LLVM must know the strides.
+    All arrays are flat, because LLVM must know the distances between rows.
     """
     pose = in_registers(camera.pose)
     for k in range(count):
@@ -185,7 +186,7 @@ def _project_block(
 
 @device
 def _write_color(i: int, j: int, colors: NDArray[np.float32], records: NDArray[np.float32]) -> bool:
-    """Write the colour of Gaussian i to record j; return True if the colour is finite."""
+    """Write the colour of Gaussian i to record j; return True if it is finite."""
     red, green, blue = colors[i, 0], colors[i, 1], colors[i, 2]
     records[j * RECORD + RED] = red
     records[j * RECORD + GREEN] = green
@@ -220,7 +221,7 @@ def _record_block(
     boxes: NDArray[np.int32],
     owners: NDArray[np.int32],
 ) -> int:
-    """Write records of the chosen Gaussians that touch a pixel; return the next record."""
+    """Write the records of the chosen Gaussians that touch a pixel; return the next free record."""
     j = first_record
     width, height = camera.width, camera.height
     for k in range(chosen.size):
@@ -230,7 +231,7 @@ def _record_block(
         if limits is not None:
             published, within = square(k, width, height, projected)
             if z > near and z < math.inf:
-                # In the published code, the Gaussian is visible even if it touches no pixel.
+                # In the published code, a Gaussian counts as visible even if it touches no pixel.
                 radii[i] = published
         if not (z > near and z < math.inf and opacity >= ALPHA_THRESHOLD and opacity < math.inf):
             continue
@@ -261,7 +262,7 @@ def _record_block(
 
 @kernel
 def listed(drawn: NDArray[np.int64], owners: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return [R] the Gaussians that have a record, sorted."""
+    """Return [R] sorted indices of the Gaussians that have a record."""
     rows = np.empty(drawn.sum(), np.int32)
     next_row = 0
     for chunk in range(drawn.shape[0]):
@@ -294,32 +295,35 @@ def project(
     drawn: NDArray[np.int64],
     room: NDArray[np.int64],
 ) -> None:
-    """Project N Gaussians; the drawn Gaussians of each chunk use the first records of that chunk.
+    """Project N Gaussians and write records.
+
+    The drawn Gaussians of each chunk use the first records of the chunk.
 
     Args:
-        jobs: From `share`.
-        camera: The view.
-        near: Least depth of a drawn Gaussian.
-        dilation: Added to both variances, px^2.
-        antialiased: True if opacities are lowered to compensate the area that the dilation adds.
-        analytic: Any vector selects records of the analytic response (without dilation); None
-            selects the plain response.
-        limits: [N, 2] written per record: first and last column of 16 pixels that the record may
-            touch, by the published footprint; None selects the footprint alpha >= 1/255.
-        means: [N, 3].
-        quats: [N, 4] wxyz, any norm.
-        scales: [N, 3] linear.
-        opacities: [N].
-        colors: [N, 3] RGB; if None, `sh_forward` writes the colours of the records.
-        radii: [N] written, pixels; 0 if nothing is touched.
-        records: [N * RECORD] written.
-        depths: [N] written per record.
-        boxes: [N, 4] written per record: tile columns and rows [x0, x1), [y0, y1).
-        owners: [N] written per record: index of its Gaussian.
-        buckets: [N, BUCKET] first slots written per record: number of tiles in earlier boxes of the
-            chunk.
-        drawn: [chunks] written: records of each chunk.
-        room: [chunks] written: tiles in the boxes of each chunk.
+        jobs: Work queue from `share`.
+        camera: The camera of the view.
+        near: Minimum depth of a drawn Gaussian.
+        dilation: Variance that is added to both axes of the image, px^2.
+        antialiased: True if opacities are lowered to compensate for the area that the dilation
+            adds.
+        analytic: An array with any content selects records of the analytic response (without
+            dilation); None selects the plain response.
+        limits: [N, 2] output per record: first and last column of 16 pixels that it may touch in
+            the published footprint; None selects the footprint alpha >= 1/255.
+        means: [N, 3] centres.
+        quats: [N, 4] rotations wxyz, any length.
+        scales: [N, 3] standard deviations.
+        opacities: [N] opacities.
+        colors: [N, 3] RGB; if None, `sh_forward` later writes the colours of the records.
+        radii: [N] output: radius in pixels; 0 if no pixel is touched.
+        records: [N * RECORD] output: the records.
+        depths: [N] output per record: depth of the centre.
+        boxes: [N, 4] output per record: tile columns and rows [x0, x1), [y0, y1).
+        owners: [N] output per record: index of the Gaussian.
+        buckets: [N, BUCKET] output per record: the first slot, which is the number of tiles in
+            earlier boxes of the chunk.
+        drawn: [chunks] output: number of records of each chunk.
+        room: [chunks] output: number of tiles in the boxes of each chunk.
     """
     count = means.shape[0]
     projected = np.empty(FOUND * BLOCK, np.float64)

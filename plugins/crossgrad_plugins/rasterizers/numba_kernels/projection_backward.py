@@ -1,4 +1,4 @@
-"""Conversion of the sums per entry to gradients of the Gaussians' parameters."""
+"""Conversion of the sums per Gaussian and tile to gradients of the Gaussians' parameters."""
 
 import math
 
@@ -60,7 +60,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 from crossgrad_plugins.rasterizers.numba_kernels.reduction import add_up
 from crossgrad_plugins.rasterizers.numba_kernels.tiles.analytic import main_axes
 
-# Rows of a block: first the sums in the order of the layout, then the parameters of its Gaussians,
+# Rows of a block: first the sums in the order of the layout, then the parameters of the Gaussians,
 # then the results.
 _MEAN = PARTIAL
 _QUAT = _MEAN + 3
@@ -82,7 +82,7 @@ def _unproject_block(
     analytic: NDArray[np.float32] | None,
     block: NDArray[np.float64],
 ) -> None:
-    """Compute the gradients of `count` Gaussians; the loop is branch-free and is vectorised."""
+    """Compute the gradients of `count` Gaussians in a vectorised loop without branches."""
     pose = in_registers(camera.pose)
     pose_x, pose_y, pose_z = pose[0][:3], pose[1][:3], pose[2][:3]
     for k in range(count):
@@ -144,11 +144,11 @@ def _unproject_block(
         )
         put_four(block, _V_QUAT, k, v_quat)
 
-        # row_x = fx / z (pose_x - slope_x pose_z), and the same in y
+        # row_x = fx / z (pose_x - slope_x pose_z), and analogously in y
         v_row_x, v_row_y = weighted_sum(columns, v_p), weighted_sum(columns, v_q)
         v_slope_x = -camera.fx * inverse_z * dot(pose_z, v_row_x)
         v_slope_y = -camera.fy * inverse_z * dot(pose_z, v_row_y)
-        # u = fx x / z + cx; the Jacobian uses x / z as its slope only inside its bounds
+        # u = fx x / z + cx; in the Jacobian, x / z is the slope only inside its bounds
         v_ratio_x = camera.fx * v_u + (v_slope_x if slope_x == ratio_x else 0.0)
         v_ratio_y = camera.fy * v_v + (v_slope_y if slope_y == ratio_y else 0.0)
         v_inverse_z = z * (dot(row_x, v_row_x) + dot(row_y, v_row_y))
@@ -200,10 +200,12 @@ def _fill_block(
     v_colors: NDArray[np.float32],
     v_absolute: NDArray[np.float32],
 ) -> tuple[int, int]:
-    """Fill a block with Gaussians that have gradients; write gradients that need no projection.
+    """Fill a block with Gaussians that have gradients.
+
+    Gradients that do not need the projection are written at once.
 
     Returns:
-        The next record, and the number of Gaussians in the block; `numbers` receives their indices.
+        The next record, and the number of Gaussians in the block; `numbers` gets their indices.
     """
     size = 0
     j = first_record
@@ -250,7 +252,7 @@ def _write_block(
         for axis in range(2):
             v_centres[i, axis] = get(block, _V_CENTRE + axis, k)
         if analytic is None and v_absolute.shape[0] > 0:
-            # These sums are in units of the decays of the records.
+            # These sums are in units of the records' decays.
             v_absolute[i, 0] *= get(block, _INVERSE_VARIANCE, k)
             v_absolute[i, 1] *= 2.0 * math.log(2.0)
 
@@ -280,31 +282,34 @@ def project_backward(
     v_centres: NDArray[np.float32],
     v_absolute: NDArray[np.float32],
 ) -> None:
-    """Sum each Gaussian's slots, and convert the sums to gradients of its parameters.
+    """Sum the slots of each Gaussian, and convert the sums to gradients of its parameters.
 
     Args:
-        jobs: From `share`.
-        camera: The view.
-        dilation: Px^2.
-        antialiased: True if opacities were lowered.
-        analytic: Any vector selects the analytic response; None selects the plain response.
-        with_depth: True if the partial sums contain gradients of the depth.
-        means: [N, 3].
-        quats: [N, 4].
-        scales: [N, 3].
-        opacities: [N].
-        drawn: [chunks].
-        owners: [N].
-        buckets: [N, BUCKET] from binning.
-        written: [slots] from `differentiate`.
-        partials: [(slots + 1) * PARTIAL] from `differentiate`; the last row is zero.
-        v_means: [N, 3] written, zero for Gaussians without gradients, like all arrays below.
-        v_quats: [N, 4].
-        v_scales: [N, 3].
-        v_opacities: [N].
-        v_colors: [N, 3], with respect to the rendered RGB; written for drawn Gaussians only.
-        v_centres: [N, 2], of the projected mean, per pixel.
-        v_absolute: [N, 2], sums of absolute values; [0, 2] if not computed.
+        jobs: Work queue from `share`.
+        camera: The camera of the view.
+        dilation: Variance that was added to both axes of the image, px^2.
+        antialiased: True if opacities were lowered to compensate for the dilation.
+        analytic: An array with any content selects the analytic response; None selects the plain
+            response.
+        with_depth: True if the partial sums contain gradients with respect to the depth.
+        means: [N, 3] centres.
+        quats: [N, 4] rotations wxyz.
+        scales: [N, 3] standard deviations.
+        opacities: [N] opacities.
+        drawn: [chunks] number of records of each chunk.
+        owners: [N] Gaussian of each record.
+        buckets: [N, BUCKET] range of slots per record.
+        written: [slots] flags from `differentiate`: 1 for slots with sums.
+        partials: [(slots + 1) * PARTIAL] sums from `differentiate`; the last row is zero.
+        v_means: [N, 3] output, which is zero for Gaussians without gradients, like all outputs
+            below.
+        v_quats: [N, 4] output.
+        v_scales: [N, 3] output.
+        v_opacities: [N] output.
+        v_colors: [N, 3] output with respect to the rendered RGB, only for drawn Gaussians.
+        v_centres: [N, 2] output with respect to the projected mean, per pixel.
+        v_absolute: [N, 2] output: sums of absolute values of the pixels' gradients; [0, 2] if not
+            computed.
     """
     sums = np.empty(PARTIAL, np.float32)
     block = np.empty(_ROWS * BLOCK, np.float64)

@@ -1,4 +1,4 @@
-"""Records of the Gaussians that touch a pixel, computed from projected Gaussians."""
+"""Records of the Gaussians that touch a pixel, from projected Gaussians."""
 
 import math
 
@@ -42,37 +42,37 @@ from crossgrad_plugins.rasterizers.numba_kernels.tiles.analytic import (
     window,
 )
 
-#: Rows of a block of projected Gaussians, visible or not: camera depth, projected mean (pixels),
-#: dilated 2-D covariance (px^2), determinant of the covariance (negative if the Gaussian cannot be
+#: Rows of a block of projected Gaussians, visible or not. The rows are camera depth, projected mean
+#: (pixels), dilated 2-D covariance (px^2), its determinant (negative if the Gaussian cannot be
 #: drawn), and the factor of the opacity.
 CAMERA_DEPTH, MEAN_U, MEAN_V, VARIANCE_X, COVARIANCE, VARIANCE_Y, DETERMINANT, FACTOR = range(8)
-#: Rows of the plain response: 1 / variance in y, slope of the line through the centres of the pixel
-#: rows, variance and decay along a pixel row, log2 of the opacity, and both half-extents of the
-#: footprint (pixels).
+#: Rows of the plain response. The rows are 1 / variance in y, slope of the line through the centres
+#: of the pixel rows, variance and decay along a pixel row, log2 of the opacity, and both
+#: half-extents of the footprint (pixels).
 _INVERSE_C, _SLOPE, _VARIANCE, _DECAY, _LOG_OPACITY, _EXTENT_X, _EXTENT_Y = range(8, 15)
 FOUND = 15
 
-#: The published footprint: number of standard deviations, lower bound of the squared half
-#: difference of the variances (px^4), and side of the tiles (pixels).
+#: Values of the published footprint: number of standard deviations, lower bound of the squared half
+#: difference of the variances (px^4), and side of a tile (pixels).
 SIGMAS, LEAST_SPREAD, SQUARE = 3.0, 0.1, 16.0
 #: First and last pixel column, and first and last pixel row.
 Rectangle = tuple[float, float, float, float]
-#: Numbers of a record except the mean and the colour, in the order of the layout. For the plain
-#: response, they are SLOPE to LOG_OPACITY. For the analytic response, they are COSINE to INVERSE_2,
-#: REACH_1 to RADIUS, and PEAK.
+#: Numbers of a record except mean and colour, in the order of the layout. For the plain response,
+#: the numbers are SLOPE to LOG_OPACITY. For the analytic response, the numbers are COSINE to
+#: INVERSE_2, REACH_1 to RADIUS, and PEAK.
 Plain = tuple[float, float, float, float, float]
 Analytic = tuple[float, float, float, float, float, float, float, float]
 
 _LARGEST_RADIUS = 2.0**30
-# Gaussians with larger projected values are dropped. This limit is well inside the range of
-# float32.
+# Gaussians with larger projected values are not drawn. This limit is far below the largest float32
+# number.
 _LARGEST = 1e30
 _STEEPEST = 1e15
 # Smallest decay in a record (px^-2). A Gaussian with this decay is constant over any image, and the
-# inverse of the decay is a valid float32 number.
+# inverse of the decay is still a valid float32 number.
 _FLAT = 1e-30
 
-# The bits of a float64: number of mantissa bits, exponent of 1, and the bits of 1.0.
+# The format of a float64: number of mantissa bits, exponent of 1, and the bits of 1.0.
 _MANTISSA_BITS, _BIAS = 52, 1023
 _MANTISSA, _ONE = np.int64((1 << _MANTISSA_BITS) - 1), np.int64(_BIAS << _MANTISSA_BITS)
 _ROOT_OF_TWO = math.sqrt(2.0)
@@ -80,13 +80,13 @@ _ROOT_OF_TWO = math.sqrt(2.0)
 
 @device
 def first_pixel(low: float) -> float:
-    """Return the first pixel (from 0) whose centre is at or after `low`."""
+    """Return the first pixel, counted from 0, whose centre is at or after `low`."""
     return max(np.ceil(low - 0.5), 0.0)
 
 
 @device
 def last_pixel(high: float, size: int) -> float:
-    """Return the last pixel of `size` whose centre is at or before `high`."""
+    """Return the last of `size` pixels whose centre is at or before `high`."""
     return min(np.floor(high - 0.5), size - 1.0)
 
 
@@ -145,7 +145,7 @@ def _pixels(
     height: int,
     within: Rectangle,
 ) -> Rectangle:
-    """Return the pixels that a footprint may touch (x0 > x1 or y0 > y1 means none)."""
+    """Return the pixels that a footprint may touch; x0 > x1 or y0 > y1 means none."""
     return (
         max(first_pixel(u - extent_x), within[0]),
         min(last_pixel(u + extent_x, width), within[1]),
@@ -163,7 +163,7 @@ def place_record(
     records: NDArray[np.float32],
     boxes: NDArray[np.int32],
 ) -> None:
-    """Write the mean and the tile box of record j."""
+    """Write the mean and the box of tiles of record j."""
     at = j * RECORD
     records[at + U_WHOLE] = np.floor(u)
     records[at + U_PART] = u - np.float64(records[at + U_WHOLE])
@@ -177,19 +177,19 @@ def place_record(
 
 @device
 def square(k: int, width: int, height: int, found: NDArray[np.float64]) -> tuple[int, Rectangle]:
-    """Return the published radius of projected Gaussian k and the pixels that it may touch.
+    """Return the published radius of projected Gaussian k, and the pixels that it may touch.
 
-    The function returns the pixels of all 16 x 16 tiles that overlap a square around the mean. Half
-    the side of the square is the published radius. The radius is three standard deviations, as in
-    3DGS, or 0 if the square is outside the image. The squared half difference of the variances is
-    at least 0.1.
+    The pixels are those in all 16 x 16 tiles that overlap a square around the mean. Half the side
+    length of the square is the published radius. The radius is three standard deviations, rounded
+    up, as in 3DGS; it is 0 if the square is outside the image. In the formula for the radius, the
+    squared half difference of the variances is at least 0.1.
     """
     u, v = get(found, MEAN_U, k), get(found, MEAN_V, k)
     a, b, c = get(found, VARIANCE_X, k), get(found, COVARIANCE, k), get(found, VARIANCE_Y, k)
     nothing = 0, (1.0, 0.0, 1.0, 0.0)
     half = 0.5 * (a - c)
     largest = 0.5 * (a + c) + math.sqrt(max(LEAST_SPREAD, half * half + b * b))
-    # A sum that is not finite fails the comparison.
+    # If the sum is infinite or NaN, the comparison is false.
     if not (get(found, DETERMINANT, k) > 0.0 and abs(u) + abs(v) + largest < _LARGEST):
         return nothing
     radius = np.ceil(SIGMAS * math.sqrt(largest))
@@ -208,19 +208,19 @@ def square(k: int, width: int, height: int, found: NDArray[np.float64]) -> tuple
 
 @device
 def first_tile(low: float) -> float:
-    """Return the first tile of the published grid at or after `low`, pixels."""
+    """Return the first tile of the published grid at or after position `low`, pixels."""
     return max(np.floor((low - 0.5) / SQUARE), 0.0)
 
 
 @device
 def last_tile(high: float) -> float:
-    """Return the last tile of the published grid at or before `high`, pixels, or -1 for none."""
+    """Return the last tile of the published grid at or before position `high`; -1 for none."""
     return max(np.floor((high - 0.5) / SQUARE), -1.0)
 
 
 @device
 def _radius(extent: float) -> int:
-    """Return the radius that is reported for a footprint of half-extent `extent`."""
+    """Return the reported radius of a footprint whose half-extent is `extent`."""
     return np.int32(max(1.0, np.ceil(min(extent, _LARGEST_RADIUS))))
 
 
@@ -228,9 +228,9 @@ def _radius(extent: float) -> int:
 def log2_of(value: float) -> float:
     """Return log2 of a normal positive number, with an error below 1e-13.
 
-    For smaller positive numbers, 0 and negative numbers, the result is at most -1000. For NaN and
-    infinity the result is undefined, so callers check their arguments. LLVM vectorises loops that
-    call this function, but not loops that call the C library.
+    For 0, negative numbers and subnormal numbers, the result is at most -1000. For NaN and
+    infinity, the result is undefined, so callers must check their arguments. LLVM can vectorise
+    loops that call this function, but not loops that call the C library's logarithm.
     """
     raw = np.float64(value).view(np.int64)
     exponent = (raw >> _MANTISSA_BITS) - _BIAS
@@ -249,7 +249,7 @@ def log2_of(value: float) -> float:
 
 @device
 def shape_block(count: int, opacities: NDArray[np.float32], found: NDArray[np.float64]) -> None:
-    """Compute the plain response of `count` projected Gaussians, drawn or not."""
+    """Compute the plain response of `count` projected Gaussians, visible or not."""
     for k in range(count):
         a, c, det = get(found, VARIANCE_X, k), get(found, VARIANCE_Y, k), get(found, DETERMINANT, k)
         inverse_c = 1.0 / c
@@ -267,7 +267,7 @@ def shape_block(count: int, opacities: NDArray[np.float32], found: NDArray[np.fl
 
 @device
 def _reach(log_opacity: float) -> float:
-    """Return the largest squared distance of a touched pixel, in standard deviations."""
+    """Return the largest squared distance, in standard deviations, of a touched pixel."""
     return 2.0 / LOG2_E * (log_opacity - TOUCH)
 
 
@@ -277,8 +277,8 @@ def plain_shape(
 ) -> tuple[int, Rectangle, Plain]:
     """Return the radius of projected Gaussian k, its pixels, and the numbers of its record.
 
-    The radius is 0 if the Gaussian touches no pixel. The function writes no array: if a function
-    has several returns, Numba counts references to its arrays, which takes time.
+    The radius is 0 if the Gaussian touches no pixel. The function writes no array. With several
+    return statements, Numba would count references to arrays, which takes time.
     """
     nothing = 0, (1.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0)
     u, v = get(found, MEAN_U, k), get(found, MEAN_V, k)
@@ -286,8 +286,7 @@ def plain_shape(
     inverse_c, slope, variance, decay = get_four(found, _INVERSE_C, k)
     log_opacity = get(found, _LOG_OPACITY, k)
     reach = _reach(log_opacity)
-    # If any term is NaN or infinite, the sums are NaN or infinite too, and they fail the
-    # comparison.
+    # If a term is NaN or infinite, the sum is NaN or infinite, and the comparison is false.
     if not (
         det > 0.0
         and reach >= 0.0
@@ -313,7 +312,7 @@ def plain_shape(
 
 @device
 def write_plain(j: int, numbers: Plain, records: NDArray[np.float32]) -> None:
-    """Write the numbers of record j of the plain response."""
+    """Write the numbers of record j for the plain response."""
     at = j * RECORD
     records[at + SLOPE] = numbers[0]
     records[at + ROW_DECAY] = numbers[1]
@@ -350,7 +349,7 @@ def analytic_shape(
     within: Rectangle,
     found: NDArray[np.float64],
 ) -> tuple[int, Rectangle, Analytic]:
-    """Return the values that `plain_shape` returns, for the analytic response."""
+    """Return the values of `plain_shape` for the analytic response."""
     nothing = 0, (1.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     u, v = get(found, MEAN_U, k), get(found, MEAN_V, k)
     a, c, det = get(found, VARIANCE_X, k), get(found, VARIANCE_Y, k), get(found, DETERMINANT, k)
@@ -400,7 +399,7 @@ def analytic_shape(
 
 @device
 def write_analytic(j: int, numbers: Analytic, records: NDArray[np.float32]) -> None:
-    """Write the numbers of record j of the analytic response."""
+    """Write the numbers of record j for the analytic response."""
     at = j * RECORD
     records[at + COSINE], records[at + SINE] = numbers[0], numbers[1]
     records[at + INVERSE_1], records[at + INVERSE_2] = numbers[2], numbers[3]

@@ -9,7 +9,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.binning import FIRST_SLOT, SLOT
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
 from crossgrad_plugins.rasterizers.numba_kernels.layout import CHUNK, PARTIAL
 
-#: Memory is prefetched this many slots ahead. Records are consecutive in memory.
+#: Memory is prefetched for slots this far ahead. The records are consecutive in memory.
 _AHEAD = 32
 
 
@@ -21,9 +21,9 @@ def add_up(
     partials: NDArray[np.float32],
     sums: NDArray[np.float32],
 ) -> bool:
-    """Sum the written rows of a record's slots; return True if there was at least one.
+    """Sum the rows of a record's slots; return True if at least one row was written.
 
-    `partials` ends with a row of zeros.
+    The last row of `partials` must be zero.
     """
     zeros = written.shape[0]
     low, high = splat(np.float32(0.0)), splat(np.float32(0.0))
@@ -48,15 +48,15 @@ def count_pixels(
     counts: NDArray[np.int32],
     pixels: NDArray[np.int32],
 ) -> None:
-    """Sum the pixels in which each Gaussian was blended.
+    """Sum for each Gaussian the number of pixels in which it was blended.
 
     Args:
-        jobs: From `share`.
-        drawn: [chunks] from `project`.
-        owners: [N] from `project`.
-        buckets: [N, BUCKET] from binning.
-        counts: [slots] pixels per slot.
-        pixels: [N] written for the drawn Gaussians; zero before.
+        jobs: Work queue from `share`.
+        drawn: [chunks] number of records of each chunk, from `project`.
+        owners: [N] Gaussian of each record, from `project`.
+        buckets: [N, BUCKET] range of slots per record.
+        counts: [slots] number of pixels per slot.
+        pixels: [N] output for the drawn Gaussians; must be zero at the start.
     """
     chunks = drawn.shape[0]
     chunk = next_job(jobs, chunks)

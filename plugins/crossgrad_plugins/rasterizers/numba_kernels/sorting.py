@@ -5,16 +5,17 @@ from numpy.typing import NDArray
 
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
 
-#: Maximum number of bits of a digit. With more bits, the counters would fill the first-level cache.
+#: Maximum number of bits that one pass of the sort uses. With more bits, the counters would not
+#: leave space in the first-level cache.
 _DIGIT = 11
-#: Number of low bits of a float64 depth that are dropped. Depths that agree to 2e-10 then count as
-#: equal.
+#: Number of low bits of a float64 depth that are ignored. Depths that differ relatively by less
+#: than 2e-10 then count as equal.
 _DROPPED = 20
 
 
 @device
 def _width(number: int) -> int:
-    """Return the number of bits of a number that is not negative."""
+    """Return the number of bits of a non-negative number."""
     width = 0
     while number >> width:
         width += 1
@@ -23,7 +24,7 @@ def _width(number: int) -> int:
 
 @kernel
 def order_by_depth(depths: NDArray[np.float64], items: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return `items` by rising depth; equal depths keep their order.
+    """Return `items` in ascending order of depth; items with equal depths keep their order.
 
     Args:
         depths: [M] positive camera depths of the items.
@@ -32,23 +33,23 @@ def order_by_depth(depths: NDArray[np.float64], items: NDArray[np.int32]) -> NDA
     count = items.shape[0]
     if count == 0:
         return items.copy()
-    # Positive floating-point numbers have the same order as their bit patterns. The difference of a
-    # pattern from the smallest pattern has few bits. The index of the item therefore fits into the
-    # same integer, and fewer digits are sorted.
+    # Positive floating-point numbers have the order of their bit patterns. Subtract the smallest
+    # bit pattern, because the difference needs few bits. The index of the item then fits into the
+    # same integer, and the sort needs fewer passes.
     bits = depths.view(np.int64)
     least, most = bits[0] >> _DROPPED, bits[0] >> _DROPPED
     for i in range(count):
         least, most = min(least, bits[i] >> _DROPPED), max(most, bits[i] >> _DROPPED)
     of_key, of_place = _width(most - least), _width(count - 1)
-    # This branch is needed only for about a million items whose depths span all orders of
+    # This branch is needed only for about a million items whose depths differ by many orders of
     # magnitude.
     coarser = max(0, of_key + of_place - 63)
     of_key -= coarser
-    # Use at least one pass, because the number of bits must not be negative.
+    # Use at least one pass, so that no division by zero passes occurs.
     passes = max(1, (of_key + _DIGIT - 1) // _DIGIT)
     of_digit = (of_key + passes - 1) // passes
     last_bin = (1 << of_digit) - 1
-    # Use unsigned indices, so that the compiled code does not check for negative values.
+    # With unsigned indices, the compiled code does not test for negative values.
     bins = np.zeros((passes, last_bin + 1), np.uint32)
     packed, spare = np.empty(count, np.int64), np.empty(count, np.int64)
     for i in range(count):

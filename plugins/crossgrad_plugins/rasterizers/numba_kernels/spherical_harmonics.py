@@ -1,4 +1,4 @@
-"""View-dependent colour from real spherical harmonics up to degree 3."""
+"""View-dependent colour from real spherical harmonics (SH) up to degree 3."""
 
 import math
 
@@ -33,14 +33,14 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 
 #: Number of floats in a cache line.
 _LINE = 16
-#: Number of Gaussians whose basis functions are computed before the first function is used.
-#: Coefficients are also prefetched this many Gaussians ahead.
+#: Number of Gaussians whose basis functions are computed before the first one is used. Coefficients
+#: are also prefetched for Gaussians this far ahead.
 _BLOCK = WIDE
 
 
 @device
 def _bring_near(rest: NDArray[np.float32], i: int) -> None:
-    """Prefetch the coefficients of Gaussian i into the cache."""
+    """Prefetch the SH coefficients of Gaussian i into the cache."""
     width = 3 * rest.shape[1]
     for at in range(0, width, _LINE):
         prefetch(rest, i * width + at)
@@ -58,7 +58,7 @@ def _look(
     table: NDArray[np.float32],
     bases: NDArray[np.float32],
 ) -> None:
-    """Write unit vectors and inverse distances of a block, and one row of basis functions each."""
+    """Write the unit vectors, inverse distances and basis functions of a block of Gaussians."""
     for j in range(last - first):
         put_way(means, np.intp(owners[first + j]), eye, ways, j)
     normalize(ways)
@@ -79,19 +79,20 @@ def sh_forward(
     records: NDArray[np.float32],
     radii: NDArray[np.int32],
 ) -> None:
-    """Write max(0, 1/2 + harmonics(direction)) to the colours of the records.
+    """Write max(0, 1/2 + SH(direction)) to the colours of the records.
 
     Args:
-        jobs: From `share`.
-        degree: Active degree, 0 to 3.
+        jobs: Work queue from `share`.
+        degree: Active SH degree, 0 to 3.
         eye: [3] camera centre.
-        means: [N, 3].
-        dc: [N, 1, 3] coefficients of degree 0.
-        rest: [N, B - 1, 3] coefficients of higher degrees; only active degrees are read.
-        drawn: [chunks] from `project`.
-        owners: [N] from `project`.
-        records: Flat records, colours written; a record with a non-finite colour is not drawn.
-        radii: [N], set to 0 for records with a non-finite colour.
+        means: [N, 3] centres.
+        dc: [N, 1, 3] SH coefficients of degree 0.
+        rest: [N, B - 1, 3] SH coefficients of higher degrees; only active degrees are read.
+        drawn: [chunks] number of records of each chunk, from `project`.
+        owners: [N] Gaussian of each record, from `project`.
+        records: The records, flat; their colours are written. A record with a non-finite colour is
+            not drawn.
+        radii: [N] radii; set to 0 for records with a non-finite colour.
     """
     count = (degree + 1) * (degree + 1)
     whole = count == BASIS and rest.shape[1] == HIGHER
@@ -121,7 +122,7 @@ def sh_forward(
                     colour = 0.5 + C0 * np.float64(dc[i, 0, channel])
                     colour += np.float64(colours[row + channel])
                     if not math.isfinite(colour):
-                        # Change the record, so that the Gaussian reaches no pixel.
+                        # Change the record so that the Gaussian touches no pixel.
                         records[j * RECORD + LOG_OPACITY] = -math.inf
                         radii[i] = 0
                     records[j * RECORD + RED + channel] = max(colour, 0.0)
@@ -144,24 +145,25 @@ def sh_backward(
     v_means: NDArray[np.float32],
     wanted: tuple[bool, bool, bool],
 ) -> None:
-    """Propagate gradients of the colours to coefficients and centres.
+    """Convert gradients with respect to colours to gradients of coefficients and centres.
 
     Args:
-        jobs: From `share`.
-        degree: Active degree, 0 to 3.
-        eye: [3].
-        means: [N, 3].
-        rest: [N, B - 1, 3].
-        drawn: [chunks].
-        owners: [N].
-        records: Flat records.
-        v_colors: [N, 3] gradients of the clamped colours.
-        v_dc: [N, 1, 3] written for the drawn Gaussians; zero before.
-        v_rest: [N, B - 1, 3] like `v_dc`, active degrees only; without rows if it is not written.
-        v_means: [N, 3]; the gradients of the centres are added.
-        wanted: First value: True if `v_dc` and `v_rest` have a row for each record, in the order of
-            the records (such rows are written whole, and need not be zero before). Second value:
-            True if `v_rest` is written.
+        jobs: Work queue from `share`.
+        degree: Active SH degree, 0 to 3.
+        eye: [3] camera centre.
+        means: [N, 3] centres.
+        rest: [N, B - 1, 3] SH coefficients of higher degrees.
+        drawn: [chunks] number of records of each chunk.
+        owners: [N] Gaussian of each record.
+        records: The records, flat.
+        v_colors: [N, 3] gradients with respect to the clamped colours.
+        v_dc: [N, 1, 3] output for the drawn Gaussians; must be zero at the start.
+        v_rest: [N, B - 1, 3] output like `v_dc`, only for active degrees; it has no rows if it is
+            not needed.
+        v_means: [N, 3] gradients to which the gradients of the centres are added.
+        wanted: Two flags. The first flag is True if `v_dc` and `v_rest` have one row per record, in
+            the order of the records. Such rows are written completely and need not be zero at the
+            start. The second flag is True if `v_rest` is needed.
     """
     dc_by_rows, rest_by_rows, learns = wanted
     count = (degree + 1) * (degree + 1)
@@ -182,7 +184,7 @@ def sh_backward(
                 to_dc = before + j if dc_by_rows else i
                 seen = records[j * RECORD + LOG_OPACITY] > -math.inf
                 for channel in range(3):
-                    # A channel clamped at 0 has no gradient.
+                    # A channel that is clamped to 0 has no gradient.
                     free = seen and records[j * RECORD + RED + channel] > np.float32(0.0)
                     v = v_colors[i, channel] if free else np.float32(0.0)
                     v_rgb[row + channel] = v

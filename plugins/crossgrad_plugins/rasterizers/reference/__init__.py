@@ -1,1 +1,1 @@
-"""The readable rasterizer, in parts: project, shape, bin into tiles, composite, record."""
+"""The readable rasterizer in parts: projection, shape, tiles, compositing, statistics."""

@@ -1,4 +1,4 @@
-"""Front-to-back compositing, tile by tile, as dense [pixels, Gaussians] tensors."""
+"""Front-to-back compositing, tile by tile, with dense [pixels, Gaussians] tensors."""
 
 from dataclasses import dataclass
 
@@ -12,25 +12,25 @@ from crossgrad_core.plugin import Response
 from crossgrad_plugins.rasterizers.reference.projection import Shape, coverage
 from crossgrad_plugins.rasterizers.reference.statistics import offsets
 
-#: Number of composited channels: RGB, depth, and ones for the accumulated opacity.
+#: Number of composited channels: RGB, depth, and ones, whose sum is the accumulated opacity.
 CHANNELS = 5
-#: With at most this number of (pixel, Gaussian) entries, all intermediate results are kept for the
-#: backward pass (about 0.4 GB in float64). With more entries, each tile is rendered again in the
-#: backward pass.
+#: With at most this number of (pixel, Gaussian) entries, all intermediate results are stored for
+#: the backward pass (about 0.4 GB in float64). With more entries, the backward pass renders each
+#: tile again, to save memory.
 REMEMBERED_ENTRIES = 2**21
-#: Side of a tile, pixels.
+#: Side length of a tile, pixels.
 TILE = 16
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """Data common to all tiles of an image.
+    """The data that all tiles of an image have in common.
 
     Attributes:
         size: Width and height of the image, pixels.
-        response: The response, which says how a Gaussian fills a pixel.
-        max_alpha: Cap of alpha; a capped alpha has no gradient.
-        probed: Number R of the probe's columns.
+        response: The response, which determines how alpha depends on the position of a pixel.
+        max_alpha: Maximum of alpha; a capped alpha has no gradient.
+        probed: Number R of columns for statistics of gradients.
     """
 
     size: tuple[int, int]
@@ -40,17 +40,17 @@ class Drawing:
 
 
 def splat_table(means: Tensor, depths: Tensor, colors: Tensor, shapes: Shape) -> Tensor:
-    """Return [N, 7 + S] one row per Gaussian, in the layout that `composite` reads."""
+    """Return [N, 7 + S] one row per Gaussian, in the layout that `composite` needs."""
     columns = (means, shapes.opacities[:, None], colors, depths[:, None], shapes.parameters)
     return torch.cat(columns, -1)
 
 
 @dataclass(frozen=True)
 class TileLists:
-    """The lists of all tiles, concatenated, with tiles in row-major order.
+    """The lists of all tiles, one after the other, with tiles in row-major order.
 
     Attributes:
-        rows: [P] int64 rows of the Gaussians' table, front to back within each tile.
+        rows: [P] int64 row numbers in the table of Gaussians, from front to back within each tile.
         sizes: Length of each tile's list.
     """
 
@@ -64,15 +64,16 @@ def composite_tiles(
     """Blend all tiles of an image.
 
     Args:
-        table: [V, R + 7 + S] the probe's columns and the columns of `splat_table`, front to back.
-        lists: The rows of each tile.
-        drawing: Data common to all tiles.
+        table: [V, R + 7 + S] the columns for statistics and the columns of `splat_table`, from
+            front to back.
+        lists: The row numbers of each tile.
+        drawing: The data that all tiles have in common.
 
     Returns:
-        `channels` [H, W, 5], `touched` [V] bool and `blended` [V] int64 as in `composite`.
+        `channels` [H, W, 5], `touched` [V] bool and `blended` [V] int64, as in `composite`.
     """
     # Use an embedding, because its backward pass adds in a fixed order on every device. The
-    # backward pass of indexing may use any order.
+    # backward pass of indexing may add in any order.
     tiles = torch.split(embedding(lists.rows, table), lists.sizes)
     again = len(lists.rows) * TILE**2 > REMEMBERED_ENTRIES
     images, touched, blended = [], [], []
@@ -93,24 +94,28 @@ def composite_tiles(
 
 
 def _tile_centers(size: tuple[int, int], like: Tensor) -> list[Tensor]:
-    """Return [h, w, 2] pixel centres of each tile, row-major; border tiles can be smaller."""
+    """Return [h, w, 2] pixel centres of each tile, in row-major order.
+
+    Tiles at the border can be smaller.
+    """
     columns, rows = (torch.arange(n, dtype=like.dtype, device=like.device) + 0.5 for n in size)
-    grid = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)  # [H, W, 2]
+    grid = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)
     return [tile for band in torch.split(grid, TILE) for tile in torch.split(band, TILE, 1)]
 
 
 def composite(table: Tensor, centers: Tensor, drawing: Drawing) -> tuple[Tensor, Tensor, Tensor]:
-    """Blend the Gaussians of one tile over its pixels.
+    """Blend the Gaussians of a tile over its pixels.
 
     Args:
-        table: [G, R + 7 + S] the probe's columns and the columns of `splat_table`, front to back.
+        table: [G, R + 7 + S] the columns for statistics and the columns of `splat_table`, from
+            front to back.
         centers: [P, 2] pixel centres.
-        drawing: Data common to all tiles.
+        drawing: The data that all tiles have in common.
 
     Returns:
-        `channels` [P, 5]: RGB, depth and accumulated opacity, without background; `touched` [G]
-        bool: True if the Gaussian reaches alpha >= 1/255 in any pixel; `blended` [G] int64: the
-            number of pixels in which the Gaussian was blended.
+        `channels` [P, 5] contains RGB, depth and accumulated opacity, without background. `touched`
+        [G] is True if the Gaussian has alpha >= 1/255 in any pixel. `blended` [G] int64 is the
+        number of pixels in which the Gaussian was blended.
     """
     touching, blended, weights = _blends(table, centers, drawing)
     colors_depths = table[:, drawing.probed + 3 : drawing.probed + 7]
@@ -120,13 +125,13 @@ def composite(table: Tensor, centers: Tensor, drawing: Drawing) -> tuple[Tensor,
 
 @dataclass(frozen=True, eq=False)
 class PixelCounter:
-    """A function that counts pixels of a rendered view; see `Screen.count`.
+    """Counts the blended pixels of a rendered view; see `Screen.count`.
 
     Attributes:
-        table: [V, R + 7 + S] as in `composite_tiles`, detached.
-        lists: The rows of each tile.
-        drawing: Data common to all tiles.
-        index: [V] int64, the Gaussian of each row.
+        table: [V, R + 7 + S] table of `composite_tiles`, without gradients.
+        lists: The row numbers of each tile.
+        drawing: The data that all tiles have in common.
+        index: [V] int64 index of the Gaussian of each row.
         total: Number N of all Gaussians.
     """
 
@@ -138,7 +143,7 @@ class PixelCounter:
 
     @torch.no_grad()
     def __call__(self, marked: Tensor) -> Tensor:
-        """Return [N] int32, in how many of the marked pixels [H, W] each Gaussian was blended."""
+        """Return [N] int32: in how many marked pixels [H, W] each Gaussian was blended."""
         rows = self.lists.rows
         tiles = torch.split(self.table[rows], self.lists.sizes)
         blend_counts = rows.new_zeros(len(rows))
@@ -153,7 +158,7 @@ class PixelCounter:
 
 
 def _blends(table: Tensor, centers: Tensor, drawing: Drawing) -> tuple[Tensor, Tensor, Tensor]:
-    """Return [P, G] arrays of a tile: alpha >= 1/255, the Gaussian was blended, its weight."""
+    """Return three [P, G] arrays: alpha >= 1/255, the Gaussian was blended, blending weight."""
     columns = [drawing.probed, 2, 1, 4, table.shape[1] - drawing.probed - 7]
     probe, means, opacities, _, parameters = torch.split(table, columns, -1)
     dx, dy = offsets(means, probe, centers, drawing.size)
@@ -161,24 +166,24 @@ def _blends(table: Tensor, centers: Tensor, drawing: Drawing) -> tuple[Tensor, T
     alpha = alpha.clamp(max=drawing.max_alpha)
     touching = alpha >= ALPHA_THRESHOLD
     alpha = torch.where(touching, alpha, 0.0)
-    # Transmittance behind each Gaussian, computed as if compositing did not stop.
+    # The transmittance behind each Gaussian, as if compositing did not stop.
     after = (1 - alpha).cumprod(-1)
     before = torch.cat([torch.ones_like(after[:, :1]), after], -1)[:, :-1]
-    # Transmittance never increases. All Gaussians behind the first Gaussian that stops compositing
-    # are therefore excluded too.
+    # Transmittance never increases. If a Gaussian stops compositing, all Gaussians behind it are
+    # therefore excluded too.
     blended = touching & (after >= TRANSMITTANCE_STOP)
     return touching, blended, torch.where(blended, alpha * before, 0.0)
 
 
 def tile_boxes(means: Tensor, reach: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return [N, 4] int64 tile boxes (x0, y0, x1, y1), ends excluded; empty if outside the image.
+    """Return [N, 4] int64 tile boxes (x0, y0, x1, y1) without their ends; empty if outside.
 
     Args:
-        means: [N, 2] pixels; finite.
-        reach: [N, 2] half-extents, pixels.
+        means: [N, 2] projected means, pixels; they must be finite.
+        reach: [N, 2] half-extents of the footprints, pixels.
         size: Width and height of the image, pixels.
     """
-    # One pixel is added on each side, so that rounding cannot cut a footprint.
+    # Add one pixel on each side, so that rounding does not cut off a part of a footprint.
     low, high = means - reach - 1, means + reach + 1
     limit = torch.tensor(size).to(means, non_blocking=True)
     seen = (high > 0) & (low < limit)
@@ -188,7 +193,7 @@ def tile_boxes(means: Tensor, reach: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def tile_lists(boxes: Tensor, size: tuple[int, int]) -> TileLists:
-    """Return the lists of all tiles for `boxes` [N, 4], which are in depth order."""
+    """Return the lists of all tiles for `boxes` [N, 4] in order of depth."""
     across, down = (-(-pixels // TILE) for pixels in size)
     x0, y0, x1, y1 = boxes.unbind(-1)
     counts = (x1 - x0) * (y1 - y0)

@@ -8,10 +8,11 @@ from crossgrad_core.plugin import Gaussians
 
 
 def view_colors(gaussians: Gaussians, center: Tensor) -> Tensor:
-    """Return [N, 3] RGB as seen from `center` [3].
+    """Return [N, 3] RGB as seen from the position `center` [3].
 
-    RGB colours are returned unchanged. Spherical harmonics become max(0, 0.5 + sum of bands). Bands
-    above the active degree are left out. A value that is clamped at 0 has no gradient.
+    RGB colours are returned unchanged. Spherical harmonics (SH) are evaluated as max(0, 0.5 + sum
+    of bands). Bands above the active degree are left out. A value that is clamped to 0 has no
+    gradient.
     """
     if gaussians.colors is not None:
         return gaussians.colors
@@ -24,7 +25,7 @@ def view_colors(gaussians: Gaussians, center: Tensor) -> Tensor:
 
 
 def coefficients_of(gaussians: Gaussians) -> Tensor | None:
-    """Return [N, (degree + 1)^2, 3] the bands up to the active degree; None without bands."""
+    """Return [N, (degree + 1)^2, 3] coefficients up to the active degree; None without SH."""
     if gaussians.sh_dc is None or gaussians.sh_rest is None:
         return gaussians.sh_dc
     active = gaussians.sh_rest[:, : (gaussians.sh_degree + 1) ** 2 - 1]

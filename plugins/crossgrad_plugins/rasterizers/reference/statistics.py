@@ -1,4 +1,4 @@
-"""Gradients of the projected means from the backward pass: signed, absolute, binned."""
+"""Gradients with respect to projected means in the backward pass: signed, absolute, in bins."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -9,22 +9,22 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import Screen
 
-#: Edges of the bins along the axis, in standard deviations.
+#: Edges of the bins along the longest axis, in standard deviations.
 EDGES = (-2.0, -1.0, 0.0, 1.0, 2.0)
 BINS, FIELDS = len(EDGES) + 1, 5
-#: An axis that is shorter than this on the image (pixels) points along the viewing direction, so it
-#: has no direction on the image.
+#: A projected axis that is shorter than this (pixels) points along the viewing direction, so its
+#: direction in the image is undefined.
 SHORTEST = 1e-6
 
 
 @dataclass(frozen=True)
 class Recorder:
-    """The object that receives the gradients of the drawn rows.
+    """Stores the gradients of the drawn rows in a `Screen`.
 
     Attributes:
-        screen: Receives the gradients; each backward pass replaces the gradients of the previous
-            backward pass.
-        index: [V] int64, the Gaussian of each drawn row.
+        screen: Object that gets the gradients; each backward pass replaces the gradients of the
+            last one.
+        index: [V] int64 index of the Gaussian of each drawn row.
         count: Number N of all Gaussians.
         absolute: True if absolute gradients were requested.
         axes: [V, 2] longest axes if directions were requested, else None.
@@ -37,7 +37,7 @@ class Recorder:
     axes: Tensor | None = None
 
     def record(self, signed: Tensor, sums: Tensor) -> None:
-        """Store the gradients [V, 2] of the drawn rows, and the sums from the probe's gradients."""
+        """Store the gradients [V, 2] of the drawn rows, and the sums from the probe."""
         self.screen.mean_gradient = self._scattered(signed)
         if self.absolute:
             self.screen.abs_gradient = self._scattered(sums[:, :2])
@@ -46,7 +46,10 @@ class Recorder:
             self.screen.directions = binned.view(self.count, BINS, FIELDS)
 
     def probe(self, like: Tensor) -> Tensor:
-        """Return [V, 2] zeros, or [V, 34]: two zeros, the axes, and a zero per sum of a bin."""
+        """Return the probe [V, 2] of zeros, or [V, 34].
+
+        The 34 columns are two zeros, the axes, and a zero for each sum of a bin.
+        """
         zeros = like.new_zeros(len(like), 2)
         if self.axes is None:
             return zeros
@@ -59,10 +62,11 @@ class Recorder:
 
 
 def recorded(table: Tensor, recorder: Recorder) -> tuple[Tensor, Tensor]:
-    """Return the unchanged table [V, C], recorded by the backward pass, and a probe [V, R].
+    """Return the unchanged table [V, C] and a probe [V, R]; a backward pass records gradients.
 
-    The first two columns are projected means. The probe is passed to the pixels like the means, but
-    does not change the image. The gradient of the probe contains sums over pixels (see `offsets`).
+    The first two columns of the table are projected means. The probe is a tensor of extra columns.
+    It is passed to the pixels like the means, but does not change the image. The gradient with
+    respect to the probe contains sums over pixels (see `offsets`).
     """
     result: tuple[Tensor, Tensor] = _Recorded.apply(table, recorder)  # type: ignore[no-untyped-call]
     return result
@@ -71,15 +75,15 @@ def recorded(table: Tensor, recorder: Recorder) -> tuple[Tensor, Tensor]:
 def offsets(
     means: Tensor, probe: Tensor, pixels: Tensor, size: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:
-    """Return the mean minus the pixel centre for every pixel and Gaussian: dx [P, G] and dy [P, G].
+    """Return the mean minus the pixel centre for each pixel and Gaussian: dx [P, G], dy [P, G].
 
-    The backward pass sums the pixels' gradients for the means. For the probe's first two columns
-    the backward pass sums their absolute values. For the columns after the axes, if there are such
-    columns, the backward pass sums the result of `binned_directions`.
+    The backward pass sums the gradients of the pixels for the means. For the first two columns of
+    the probe, it sums the absolute values of these gradients. If the probe has columns after the
+    axes, it sums the result of `binned_directions` for them.
 
     Args:
-        means: [G, 2] pixels.
-        probe: [G, R] from `recorded`.
+        means: [G, 2] projected means, pixels.
+        probe: [G, R] probe from `recorded`.
         pixels: [P, 2] pixel centres.
         size: Width and height of the image, pixels.
     """
@@ -117,7 +121,7 @@ class _Offsets(torch.autograd.Function):
     @override
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None, None]:
         means, probe, pixels = ctx.saved_tensors
-        both = torch.stack(gradients)  # [2, P, G]
+        both = torch.stack(gradients)
         signed, absolute = both.sum(1).T, both.abs().sum(1).T
         if probe.shape[1] == absolute.shape[1]:
             return signed, absolute, None, None
@@ -129,11 +133,14 @@ class _Offsets(torch.autograd.Function):
 
 
 def longest_axes(factors: Tensor, scales: Tensor) -> Tensor:
-    """Return [N, 2] a / |a|^2 with a the projection of each longest axis, px^-1; 0 if seen end on.
+    """Return [N, 2] a / |a|^2, px^-1, for the projection a of each longest axis.
+
+    The value is 0 if the axis points along the viewing direction.
 
     Args:
         factors: [N, 2, 3] from `Projection`: the projections of the three axes.
-        scales: [N, 3]; if scales are equal, the first scale counts as the largest.
+        scales: [N, 3] standard deviations; if scales are equal, the first one counts as the
+            largest.
     """
     longest = scales.argmax(-1)[:, None, None].expand(-1, 2, 1)
     axis = factors.gather(-1, longest).squeeze(-1)
@@ -144,24 +151,24 @@ def longest_axes(factors: Tensor, scales: Tensor) -> Tensor:
 def binned_directions(
     gradients: Tensor, offsets: Tensor, axes: Tensor, size: tuple[int, int]
 ) -> Tensor:
-    """Return [G, BINS, FIELDS] of `Screen.directions`, summed over some pixels.
+    """Return [G, BINS, FIELDS] the field `Screen.directions`, summed over some pixels.
 
     Args:
         gradients: [2, P, G] gradient of each pixel with respect to the projected mean of each
             Gaussian.
         offsets: [2, P, G] pixel centre minus mean, pixels.
-        axes: [G, 2] from `longest_axes`.
+        axes: [G, 2] axes from `longest_axes`.
         size: Width and height of the image, pixels.
     """
     scaled = gradients * torch.tensor(size).to(gradients, non_blocking=True)[:, None, None]
-    # Divide by the larger component first, because squares could underflow.
+    # Divide by the larger component first, because squares of small numbers could become zero.
     largest = scaled.abs().amax(0)
     moved = largest > 0
     scaled = scaled / torch.where(moved, largest, 1.0)
     units = scaled / torch.where(moved, scaled.square().sum(0).sqrt(), 1.0)
-    along = (offsets * axes.T[:, None, :]).sum(0)  # [P, G]
+    along = (offsets * axes.T[:, None, :]).sum(0)
     edges = torch.tensor(EDGES).to(along, non_blocking=True)
     bins = torch.bucketize(along, edges, right=True)
-    fields = torch.cat([units, gradients.abs(), moved[None].to(units)])  # [FIELDS, P, G]
+    fields = torch.cat([units, gradients.abs(), moved[None].to(units)])
     bin_sums = [torch.where(bins == number, fields, 0.0).sum(1) for number in range(BINS)]
     return torch.stack(bin_sums).permute(2, 0, 1)

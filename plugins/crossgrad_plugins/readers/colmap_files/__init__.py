@@ -1,1 +1,1 @@
-"""The files of a COLMAP model: the folder with the files, and their contents."""
+"""The files of a COLMAP model: the search for their folder, and readers of their contents."""

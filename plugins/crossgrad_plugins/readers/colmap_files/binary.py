@@ -1,7 +1,7 @@
-"""COLMAP models: their contents, and a reader of their binary files, record by record.
+"""The contents of a COLMAP model, and a reader of its binary files, record by record.
 
-pycolmap 4.2.1 is not used, because for truncated files it returns arbitrary cameras without an
-error, or loops without end and fills the memory.
+pycolmap 4.2.1 is not used for reading. For truncated files, it returns wrong cameras without an
+error, or never returns and fills the memory.
 
 Source of the format: https://colmap.github.io/format.html (`cameras.bin`, `images.bin`,
 `points3D.bin`; little-endian).
@@ -28,20 +28,20 @@ _CAMERA = struct.Struct("<IiQQ")  # id, model, width, height
 _IMAGE = struct.Struct("<I7dI")  # id, quaternion wxyz, translation, camera id
 _OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<u8")])
 _POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8")])
-_TRACK_ELEMENT = 8  # bytes: image id, index of the observation
+_TRACK_ELEMENT = 8  # bytes of a track element: image id and index of the observation
 _NO_POINT = np.uint64(2**64 - 1)
 
 
 @dataclass(frozen=True, eq=False)
 class ColmapImage:
-    """A registered image.
+    """A registered image of a model.
 
     Attributes:
-        name: Name as written in the model.
+        name: Name of the image in the model.
         camera: Id of the image's camera.
-        quaternion: [4] wxyz, world to camera, not necessarily normalised.
-        translation: [3], world to camera.
-        points: [S] uint64 ids of the points that the image observes.
+        quaternion: [4] rotation wxyz, world to camera; its length may differ from 1.
+        translation: [3] translation, world to camera.
+        points: [S] uint64 ids of the points that the image observed.
     """
 
     name: str
@@ -58,9 +58,9 @@ class ColmapModel:
     Attributes:
         cameras: Camera id -> calibration.
         images: The registered images.
-        point_ids: [P] uint64.
-        points: [P, 3] float64.
-        colors: [P, 3] uint8 RGB.
+        point_ids: [P] uint64 ids of the points.
+        points: [P, 3] float64 positions.
+        colors: [P, 3] uint8 RGB colours.
     """
 
     cameras: dict[int, Calibration]
@@ -72,7 +72,7 @@ class ColmapModel:
 
 @cache
 def camera_models() -> dict[int, tuple[str, int]]:
-    """Return the name and number of parameters of each camera model, by its number in COLMAP."""
+    """Return COLMAP's camera models: number -> name and number of parameters."""
     guard_pycolmap()
     import pycolmap
 
@@ -88,10 +88,10 @@ def camera_models() -> dict[int, tuple[str, int]]:
 
 
 def by_id(cameras: Iterable[tuple[int, Calibration]], path: Path) -> dict[int, Calibration]:
-    """Return the cameras by their ids.
+    """Return the cameras by id.
 
     Raises:
-        UserError: Two cameras have the same id.
+        UserError: Two cameras have one id.
     """
     calibrations: dict[int, Calibration] = {}
     for camera, calibration in cameras:
@@ -102,10 +102,10 @@ def by_id(cameras: Iterable[tuple[int, Calibration]], path: Path) -> dict[int, C
 
 
 def check_point_ids(ids: NDArray[np.uint64], path: Path) -> None:
-    """Refuse two points with the same id.
+    """Refuse a model in which two points have one id.
 
     Raises:
-        UserError: There are such points.
+        UserError: Two points have one id.
     """
     ordered = np.sort(ids)
     twice = np.flatnonzero(ordered[1:] == ordered[:-1])
@@ -126,7 +126,7 @@ def read_binary(folder: Path) -> ColmapModel:
     """Read `cameras.bin`, `images.bin` and, if it exists, `points3D.bin`.
 
     Raises:
-        UserError: A file is truncated, too long, or its content does not match its name.
+        UserError: A file is truncated or too long, or its content does not fit its name.
     """
     with _open(folder / "cameras.bin") as file:
         cameras = by_id(_read_cameras(file), file.path)
@@ -142,7 +142,10 @@ def read_binary(folder: Path) -> ColmapModel:
 
 
 class _Walk:
-    """A reading position in a binary file. The position cannot move past the end of the file."""
+    """A position in a binary file that is being read.
+
+    The position cannot move past the end of the file.
+    """
 
     def __init__(self, path: Path, data: mmap.mmap | bytes) -> None:
         self.path = path
@@ -150,7 +153,7 @@ class _Walk:
         self.at = 0
 
     def skip(self, size: int) -> int:
-        """Move on by `size` bytes, and return the position of the first of these bytes."""
+        """Move on by `size` bytes, and return the position before the move."""
         start, self.at = self.at, self.at + size
         if self.at > len(self.data):
             raise UserError(
@@ -163,11 +166,11 @@ class _Walk:
         return start
 
     def unpack(self, layout: struct.Struct) -> tuple[int | float, ...]:
-        """Return the next values."""
+        """Return the next values in the given format."""
         return layout.unpack_from(self.data, self.skip(layout.size))
 
     def count(self, least: int) -> int:
-        """Return the next number of records, each at least `least` bytes long."""
+        """Return the next number, a number of records of at least `least` bytes each."""
         number = int(self.unpack(_COUNT)[0])
         here = self.at
         self.skip(number * least)
@@ -175,7 +178,7 @@ class _Walk:
         return number
 
     def text(self) -> str:
-        """Return the next zero-terminated string."""
+        """Return the next text, which ends with a zero byte."""
         end = self.data.find(b"\0", self.at)
         if end < 0:
             end = len(self.data)
@@ -183,7 +186,7 @@ class _Walk:
         return os.fsdecode(self.data[start:end])
 
     def end(self) -> None:
-        """Refuse a file that was not read to its end."""
+        """Raise an error if the end of the file is not reached."""
         if self.at != len(self.data):
             raise UserError(
                 "the file continues after its last record",
@@ -203,8 +206,8 @@ def _open(path: Path) -> Iterator[_Walk]:
             "the file cannot be read", where=path, found=str(error), todo="check its permissions"
         ) from error
     with file:
-        # An empty file cannot be mapped. The map is closed when the last array that uses it is
-        # freed.
+        # An empty file cannot be mapped into memory. The memory map is closed when the last array
+        # that uses it is freed.
         empty = path.stat().st_size == 0
         yield _Walk(path, b"" if empty else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
 
@@ -239,10 +242,10 @@ def _read_images(file: _Walk) -> Iterator[ColmapImage]:
 
 
 def _read_points(file: _Walk) -> NDArray[np.void]:
-    """Return the records [P] of type `_POINT`. Tracks, of any length, are skipped."""
+    """Return the records [P] of type `_POINT`. Tracks have different lengths and are skipped."""
     number = file.count(_POINT.itemsize + _COUNT.size)
     data, at, starts = file.data, file.at, []
-    # Call no Python function of this package in this loop, because there may be millions of
+    # Do not call Python functions of this package in this loop, because there may be millions of
     # records.
     track_length, fixed = _COUNT.unpack_from, _POINT.itemsize + _COUNT.size
     try:
@@ -250,7 +253,7 @@ def _read_points(file: _Walk) -> NDArray[np.void]:
             starts.append(at)
             at += fixed + _TRACK_ELEMENT * track_length(data, at + _POINT.itemsize)[0]
     except (struct.error, OverflowError):
-        # This happens if the track is longer than the file, or if the offset is too large.
+        # The track is longer than the file, or the offset is too large.
         at += fixed
     file.skip(at - file.at)
     file.end()

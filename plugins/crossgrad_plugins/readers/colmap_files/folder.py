@@ -1,4 +1,4 @@
-"""Search for the COLMAP model in a scene folder."""
+"""Search for the COLMAP models in a scene folder."""
 
 import difflib
 import re
@@ -13,7 +13,7 @@ _PARENTS = ("sparse", "colmap/sparse")
 def find_models(scene: Path) -> list[Path]:
     """Return a scene's model folders: `sparse/0`, `sparse/1` ..., `sparse`, or the scene itself.
 
-    Models in `colmap/sparse` are included. The models are sorted by number.
+    Models in the folder `colmap/sparse` are also returned. The models are sorted by number.
     """
     models = []
     for parent in (scene / name for name in _PARENTS):
@@ -28,7 +28,7 @@ def choose_model(scene: Path, wanted: str | None) -> tuple[Path, list[str]]:
 
     Args:
         scene: The scene's folder.
-        wanted: Folder of the model within the scene, or None for the model with most images.
+        wanted: Folder of the model within the scene; None for the model with most images.
 
     Raises:
         UserError: There is no model, or the wanted model is missing.
@@ -60,7 +60,7 @@ def choose_model(scene: Path, wanted: str | None) -> tuple[Path, list[str]]:
 
 
 def check_scene_folder(scene: Path) -> None:
-    """Refuse an unreadable folder, and a model's folder where a scene's folder is expected.
+    """Refuse an unreadable folder, and the folder of a model in place of a scene.
 
     Raises:
         UserError: The path is missing, is a file, is not readable, or is inside `sparse`.
@@ -124,5 +124,5 @@ def _no_model(scene: Path) -> UserError:
 
 
 def _by_number(path: Path) -> list[tuple[int, str]]:
-    """Return a sort key that places 10 after 9."""
+    """Return a sort key with which 10 follows 9."""
     return [(int(digits or 0), digits) for digits in re.split(r"\D+", path.name)]

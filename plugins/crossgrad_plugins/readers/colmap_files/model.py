@@ -1,4 +1,4 @@
-"""COLMAP models: cameras, images and points, from binary or text files."""
+"""Readers of COLMAP models: cameras, images and points, from binary or text files."""
 
 import os
 import re
@@ -37,7 +37,7 @@ def read_text(folder: Path) -> ColmapModel:
     Images and points are sorted by their ids.
 
     Raises:
-        UserError: A line is wrong. The error names the line.
+        UserError: A line is wrong; the message names the line.
     """
     cameras = _Lines(folder / "cameras.txt")
     calibrations = by_id(_read_cameras(cameras), cameras.path)
@@ -54,10 +54,10 @@ def read_text(folder: Path) -> ColmapModel:
 
 
 class _Lines:
-    """The lines of a text file that contain data. Errors name the line.
+    """The data lines of a text file. Errors name the current line.
 
     Args:
-        path: The file.
+        path: The text file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -82,13 +82,13 @@ class _Lines:
                 yield line
 
     def next(self) -> bytes | None:
-        """Return the next line, even if it is empty or a comment, or None at the end."""
+        """Return the next line, which may be empty or a comment; None at the end."""
         self._number += 1
         line = next(self._lines, None)
         return None if line is None else line.strip()
 
     def wrong(self, line: bytes, expected: str) -> NoReturn:
-        """Refuse the line that was read last."""
+        """Raise an error about the line that was read last."""
         raise UserError(
             "a line of the COLMAP text model cannot be read",
             where=f"{self.path}, line {self._number}",
@@ -99,10 +99,10 @@ class _Lines:
 
 
 def _integer(word: bytes, most: int = _MOST) -> int:
-    """Return a whole number without a sign.
+    """Return a whole number that has no sign.
 
     Raises:
-        ValueError: The word is not a whole number without a sign, or the number is too large.
+        ValueError: The word is not a whole number without sign, or the number is too large.
     """
     if not _INTEGER.fullmatch(word) or int(word) > most:
         raise ValueError(word)
@@ -110,12 +110,12 @@ def _integer(word: bytes, most: int = _MOST) -> int:
 
 
 def _number(word: bytes) -> float:
-    """Return a number in C notation.
+    """Return a number that is written as in C.
 
     Raises:
         ValueError: The word is not a number.
     """
-    if b"_" in word:  # Python would accept digit groups with underscores.
+    if b"_" in word:  # Python would accept underscores between digits.
         raise ValueError(word)
     return float(word)
 
@@ -155,7 +155,7 @@ def _read_images(lines: _Lines) -> Iterator[tuple[int, ColmapImage]]:
 
 
 def _read_observations(lines: _Lines) -> NDArray[np.uint64]:
-    """Return the ids of the points in the line after an image. The line may be empty."""
+    """Return the point ids in the line that follows an image. The line may be empty."""
     line = lines.next() or b""
     try:
         return np.array(_observed(line), dtype=np.uint64)
@@ -167,12 +167,12 @@ def _observed(line: bytes) -> list[int]:
     words = line.split()
     if len(words) % 3 or b"_" in line:
         raise ValueError(line)
-    np.array(words, dtype=np.float64)  # Pixel positions are not needed, but they must be numbers.
+    np.array(words, dtype=np.float64)  # Pixel positions are not used, but they must be numbers.
     return [_integer(word) for word in words[2::3] if word != _NO_POINT]
 
 
 def _read_points(lines: _Lines) -> Iterator[tuple[int, list[float], list[int]]]:
-    """Yield id, position and colour of every point. Tracks, of any length, are skipped."""
+    """Yield id, position and colour of every point; tracks are skipped."""
     for line in lines:
         words = line.split(maxsplit=8)
         try:
@@ -200,17 +200,17 @@ def count_images(folder: Path) -> int:
             with (folder / "images.bin").open("rb") as file:
                 return int(_COUNT.unpack(file.read(_COUNT.size))[0])
         with (folder / "images.txt").open(encoding="utf-8", errors="replace") as lines:
-            # Each image has two lines, and the second line may be empty.
+            # Each image has two lines; the second line may be empty.
             return sum(not line.startswith("#") for line in lines) // 2
     except (OSError, struct.error):
         return 0
 
 
 def read_model(folder: Path) -> ColmapModel:
-    """Read a model. If binary and text files exist, the binary files are read, as in COLMAP.
+    """Read a model. If there are binary and text files, the binary files are read, as COLMAP does.
 
     Raises:
-        UserError: A file is missing or truncated, or its content does not match its name.
+        UserError: A file is missing or truncated, or its content does not fit its name.
     """
     return read_binary(folder) if _has(folder, "bin") else read_text(folder)
 

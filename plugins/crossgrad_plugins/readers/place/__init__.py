@@ -1,1 +1,1 @@
-"""The place of a scene on Earth, and the places where its photos were taken."""
+"""The position of a scene on Earth, and the GPS positions of its photos."""

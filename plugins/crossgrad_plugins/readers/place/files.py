@@ -1,4 +1,4 @@
-"""Places of photos from a file: OpenDroneMap's geo.txt, or a COLMAP database."""
+"""Positions of photos from a file: OpenDroneMap's geo.txt, or a COLMAP database."""
 
 import math
 import re
@@ -20,7 +20,7 @@ from crossgrad_plugins.georeference.gps_tags import Numbers, number
 from crossgrad_plugins.georeference.projection import Projection
 from crossgrad_plugins.readers.place.headers import Measured, measured
 
-#: Number of bytes in memory for each word in a list.
+#: Number of bytes in memory that each word of a list needs.
 _WORD: Final = 64
 _DEGREES: Final = re.compile(r"epsg:4326|wgs ?84|\+proj=(longlat|latlong)\b.*", re.IGNORECASE)
 _ZONE: Final = "(0?[1-9]|[1-5][0-9]|60)"
@@ -31,25 +31,26 @@ _PROJ_UTM: Final = re.compile(
 )
 _SHOWN: Final = 80
 _POSITION: Final = struct.Struct("<3d")
-_LONGEST: Final = 1 << 20  # number of bytes of a text, a blob or a row
+_LONGEST: Final = 1 << 20  # maximum number of bytes of a text, a blob or a row
 _WGS84: Final = 0  # a value of COLMAP's PosePriorCoordinateSystem
-#: The column of the photo's id: first in COLMAP 4, then in older versions.
+#: Names of the column with the photo's id: in COLMAP 4, and in older versions.
 _COLUMNS: Final = ("corr_data_id", "image_id")
 
 
 def of_list(path: Path, names: Collection[str]) -> Measured:
-    """Return the places in a list.
+    """Return the positions in a list.
 
-    The first line is the coordinate system, `EPSG:4326` for longitude and latitude. Each other line
-    contains the name of a photo, x, y and altitude. Further words in a line are ignored.
+    The first line gives the coordinate system, such as `EPSG:4326` for longitude and latitude. Each
+    other line gives the name of a photo, x, y and altitude. Further words in a line are ignored.
 
     Args:
         path: The file.
-        names: The photos of the scene. Names in the list may lack folders, and may differ in suffix
-            or case.
+        names: Names of the scene's photos. In the list, names may lack folders, and may have
+            another suffix or letter case.
 
     Raises:
-        UserError: The file cannot be read, a line lacks numbers, or the system is unknown.
+        UserError: The file cannot be read, a line lacks numbers, or the coordinate system is
+            unknown.
     """
     first, *lines = [line.split() for line in _text(path).splitlines()] or [[]]
     rows = {words[0]: _row(path, i, words) for i, words in enumerate(lines, 2) if words}
@@ -58,7 +59,7 @@ def of_list(path: Path, names: Collection[str]) -> Measured:
     loose, others = _by_file(names, _folded), [name for name in rows if name not in exact]
     times = Counter(map(_folded, others))
     for name in others:
-        # An ambiguous name is ignored, and an exact name of the same photo takes precedence.
+        # A name that matches several photos is ignored; an exact match has priority.
         photo = loose.get(_folded(name)) if times[_folded(name)] == 1 else None
         if photo is not None and photo not in photos.values():
             photos[name] = photo
@@ -75,7 +76,7 @@ def _text(path: Path) -> str:
 
 
 def _row(path: Path, line: int, words: list[str]) -> Numbers:
-    """Return x, y and altitude. A missing altitude is NaN."""
+    """Return x, y and altitude. A missing altitude is returned as NaN."""
     x, y, z = [*map(number, words[1:4]), *[math.nan] * 3][:3]
     if not math.isfinite(x) or not math.isfinite(y):
         shown = " ".join(words)[:_SHOWN]
@@ -99,7 +100,10 @@ def _folded(name: str) -> str:
 
 
 def _by_file(names: Collection[str], said: Callable[[str], str] = str) -> dict[str, str]:
-    """Return the photos of the names in `said`: by whole name, or by file name if it is unique."""
+    """Return the photos that the names in `said` match.
+
+    A name matches by its whole path, or by its file name if only one photo has this name.
+    """
     files = {name: said(PurePosixPath(name).name) for name in names}
     whole = {name: said(name) for name in names}
     photos: dict[str, str] = {}
@@ -110,10 +114,10 @@ def _by_file(names: Collection[str], said: Callable[[str], str] = str) -> dict[s
 
 
 def _system(text: str, path: Path) -> Callable[[Numbers], Numbers | None]:
-    """Return a function that converts coordinates of a system to degrees.
+    """Return a function that converts coordinates of a coordinate system to degrees.
 
     Raises:
-        UserError: The system does not exist, or pyproj is not installed.
+        UserError: The coordinate system does not exist, or pyproj is not installed.
     """
     if _DEGREES.fullmatch(text):
         return lambda xyz: (xyz[1], xyz[0], xyz[2])
@@ -135,17 +139,17 @@ def _system(text: str, path: Path) -> Callable[[Numbers], Numbers | None]:
 
 
 def of_priors(path: Path, names: Collection[str]) -> Measured:
-    """Return the GPS positions that COLMAP's feature extraction stored in its database.
+    """Return the GPS positions that COLMAP's feature extraction wrote to its database.
 
     Args:
         path: The database.
-        names: The photos of the scene.
+        names: Names of the scene's photos.
 
     Raises:
         UserError: The file is not a database of COLMAP.
     """
     try:
-        # With `immutable`, SQLite writes no file of its own next to the database.
+        # With `immutable`, SQLite creates no files beside the database.
         uri = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
         with closing(sqlite3.connect(uri, uri=True)) as database:
             database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST)
@@ -164,17 +168,17 @@ def of_priors(path: Path, names: Collection[str]) -> Measured:
 def _positions(
     database: sqlite3.Connection, names: frozenset[str], most: int
 ) -> Iterator[tuple[str, object]]:
-    """Yield names and positions of photos of the scene, or nothing if the database has no priors.
+    """Yield names and positions of photos of the scene; nothing if the database has no positions.
 
     Args:
-        database: The database.
-        names: The photos.
-        most: Greatest number of rows read from a table. The number is limited because damaged pages
-            can form an endless cycle.
+        database: The opened database.
+        names: Names of the scene's photos.
+        most: Maximum number of rows that are read from a table. Without this limit, damaged pages
+            could form an endless loop.
     """
     table_rows = database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
     tables = {row[0] for row in islice(table_rows, most)}
-    # Refuse views of the database, because a view may compute without an end.
+    # Refuse databases that contain SQL views, because reading a view may never end.
     if not {"images", "pose_priors"} <= tables:
         return
     there = {row[1] for row in database.execute("PRAGMA table_info(pose_priors)")}

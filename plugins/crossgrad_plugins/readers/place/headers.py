@@ -1,4 +1,4 @@
-"""Places of photos from the GPS positions in their EXIF headers."""
+"""GPS positions of photos from their EXIF headers."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Measured:
-    """Places where photos were taken.
+    """Positions at which photos were taken.
 
     Attributes:
-        source: Source of the places, for messages.
-        places: Name of a photo -> its place.
-        flat: Number of further photos with a place but without an altitude.
-        strangers: Names that match no photo.
+        source: Source of the positions, for messages.
+        places: Name of a photo -> its position.
+        flat: Number of further photos that have a position but no altitude.
+        strangers: Names in the source that match no photo.
     """
 
     source: str
@@ -32,17 +32,17 @@ class Measured:
 
 
 def of_headers(files: Mapping[str, Path], source: str) -> Measured:
-    """Return the places in the EXIF headers of photos. Photos without a place are omitted.
+    """Return the positions from the EXIF headers of photos. Photos without a position are left out.
 
     Args:
-        files: Name -> file. Missing files, and files that are not photos, are ignored.
+        files: Name of a photo -> its file. Missing files and files that are not photos are ignored.
         source: Description of the photos, for messages.
     """
     return measured(((name, _header(path)) for name, path in files.items()), source)
 
 
 def measured(found: Iterable[tuple[str, Numbers | None]], source: str) -> Measured:
-    """Return the valid places among the GPS numbers of photos."""
+    """Return the valid positions among the GPS numbers of photos."""
     valid: dict[str, Numbers] = {}
     flat = 0
     for name, numbers in found:
@@ -65,5 +65,5 @@ def _header(path: Path) -> Numbers | None:
     try:
         with opened(path, "the photo's EXIF header cannot be read") as image:
             return gps_of(image)
-    except UserError:  # If the photo is used, decoding raises the error again.
+    except UserError:  # If the run uses this photo, decoding reports the error.
         return None

@@ -1,4 +1,4 @@
-"""The place of a scene on Earth, from any available source."""
+"""The position of a scene on Earth, from any available source."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -24,33 +24,33 @@ from crossgrad_core.scene.wording import count
 from crossgrad_plugins.readers._json import Fields, read_object
 from crossgrad_plugins.readers.place.headers import Measured, of_headers
 
-# Most scenes are not georeferenced, so modules for positions are imported only when needed.
+# Import modules for positions only when they are needed, because most scenes are not georeferenced.
 if TYPE_CHECKING:
     from crossgrad_plugins.georeference.ellipsoid import Place
     from crossgrad_plugins.georeference.frames import Fit
     from crossgrad_plugins.georeference.on_earth import OnEarth
 
-#: Files in the scene's folder: OpenDroneMap's list of photo positions, and COLMAP's databases.
+#: Files in the scene's folder: OpenDroneMap's list of photo positions, and COLMAP's database.
 _LIST: Final = "geo.txt"
 _DATABASES: Final = ("database.db", "colmap/database.db")
 
 
 def at(scene: Scene, place: Georeference) -> Scene:
-    """Return the scene with a georeference and with the note of the georeference."""
+    """Return the scene with a georeference and a note about it."""
     return replace(scene, georeference=place, notes=(*scene.notes, place.note))
 
 
 def by_gps(scene: Scene, raw: RawScene, named: Path | None = None) -> Scene:
-    """Return the scene at the place given by the GPS of its photos, if enough photos have GPS.
+    """Return the scene, georeferenced by the GPS positions of its photos if there are enough.
 
     Args:
         scene: The scene.
-        raw: The raw scene from which `scene` was made.
-        named: A list of places, or a folder with the original photos. If it is given, no other
-            source is used.
+        raw: The raw scene, from which `scene` was made.
+        named: A list of positions, or a folder with the original photos. If `named` is given, no
+            other source is used.
 
     Raises:
-        UserError: The named source is missing or cannot be read.
+        UserError: The source `named` is missing or cannot be read.
     """
     notes: list[str] = []
     for measured in _sources(scene, raw, named, notes):
@@ -76,7 +76,7 @@ def by_gps(scene: Scene, raw: RawScene, named: Path | None = None) -> Scene:
 def _sources(
     scene: Scene, raw: RawScene, named: Path | None, notes: list[str]
 ) -> Iterator[Measured]:
-    """Yield the places where photos were taken, one source after the other."""
+    """Yield the GPS positions of photos, one source after the other."""
     names = [view.name for view in scene.views]
     if named is not None:
         yield _named(named, names)
@@ -86,13 +86,13 @@ def _sources(
             try:
                 yield _listed(path, names)
             except UserError as error:
-                # A run does not need the georeference, so report the error as a note.
+                # A run does not need the georeference, so this error becomes a note.
                 notes.append(f"{path.name} contains no positions: {error.what} ({error.found})")
     yield of_headers({view.name: _file_of(view, raw) for view in scene.views}, "GPS of the photos")
 
 
 def _listed(path: Path, names: list[str]) -> Measured:
-    """Return the places in a list, or in a COLMAP database."""
+    """Return the positions in a list or in a COLMAP database."""
     if path.suffix == ".db":
         from crossgrad_plugins.readers.place.files import of_priors
 
@@ -103,10 +103,10 @@ def _listed(path: Path, names: list[str]) -> Measured:
 
 
 def _file_of(view: View, raw: RawScene) -> Path:
-    """Return the photo's own file, because a smaller copy may lack the EXIF header."""
+    """Return the original file of a photo, because a reduced copy may have no EXIF header."""
     path = raw.images / view.name
     if isinstance(view.photo, FilePhoto) and not is_file(path):
-        return view.photo.source.path  # The file was found with another suffix.
+        return view.photo.source.path  # The file has another suffix than its name in the scene.
     return path
 
 
@@ -126,7 +126,7 @@ def _named(path: Path, names: list[str]) -> Measured:
 
 
 def _fitted(scene: Scene, views: list[View], measured: Measured) -> "OnEarth | str":
-    """Return the place fitted to photos with a measured place, or the reason why the fit failed."""
+    """Return the position fitted to photos with GPS, or the reason why the fit failed."""
     from crossgrad_plugins.georeference.ellipsoid import geocentric, place_at
     from crossgrad_plugins.georeference.frames import fit_similarity
     from crossgrad_plugins.georeference.on_earth import OnEarth
@@ -146,7 +146,7 @@ def _fitted(scene: Scene, views: list[View], measured: Measured) -> "OnEarth | s
 
 
 def _residuals(fit: "Fit") -> dict[str, float]:
-    """Return the residuals of the photos that were kept, in metres."""
+    """Return the residuals of the photos that were used in the fit, in metres."""
     errors = fit.errors[fit.kept]
     return {
         "rms_horizontal": float(np.sqrt((errors[:, :2] ** 2).sum(axis=1).mean())),
@@ -156,21 +156,21 @@ def _residuals(fit: "Fit") -> dict[str, float]:
 
 
 def _centers(scene: Scene, views: list[View]) -> NDArray[np.float64]:
-    """Return the camera centres [N, 3] in the coordinates of the input."""
+    """Return [N, 3] camera centres in the coordinates of the input."""
     return scene.similarity.to_input(centers_of(views))
 
 
 def by_code(scene: Scene, code: str) -> Scene:
-    """Return the scene with its place, for poses in map coordinates or geocentric coordinates.
+    """Return the scene with its georeference, for poses in map or geocentric coordinates.
 
     Args:
         scene: The scene.
-        code: The coordinate system, such as `epsg:32633`. `epsg:4978` means geocentric coordinates
-            of WGS 84.
+        code: The coordinate system, such as `epsg:32633`. The code `epsg:4978` means geocentric
+            coordinates on WGS 84.
 
     Raises:
-        UserError: The system does not exist, the scene is outside of its area, or the system is not
-            uniform in scale.
+        UserError: The coordinate system does not exist, does not cover the scene, or has different
+            scales along its axes.
     """
     from crossgrad_plugins.georeference.ellipsoid import place_at
     from crossgrad_plugins.georeference.on_earth import OnEarth
@@ -195,7 +195,7 @@ def by_code(scene: Scene, code: str) -> Scene:
 
 
 def by_file(scene: Scene, file: Path) -> Scene:
-    """Return the scene at the place in a `georef.json` (docs/coordinates.md).
+    """Return the scene with the georeference of a `georef.json` (docs/coordinates.md).
 
     Raises:
         UserError: The file cannot be read, or its transform is not a similarity.
@@ -215,10 +215,10 @@ def by_file(scene: Scene, file: Path) -> Scene:
 
 
 def origin_of(fields: Fields) -> "Place":
-    """Return the place of an object with latitude, longitude and altitude.
+    """Return the position that an object gives by latitude, longitude and altitude.
 
     Raises:
-        UserError: A number is missing, or is not a position on Earth.
+        UserError: A number is missing, or the numbers are not a position on Earth.
     """
     from crossgrad_plugins.georeference.ellipsoid import Place
 

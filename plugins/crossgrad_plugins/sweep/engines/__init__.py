@@ -1,6 +1,6 @@
-"""Engines that carry out runs: this machine, a Ray cluster, or Slurm; each engine is one function.
+"""Engines that execute runs: this machine, a Ray cluster, or Slurm.
 
-An engine is imported only if a sweep names it.
+Each engine is one function. The module of an engine is imported only if a sweep names the engine.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -14,7 +14,7 @@ from crossgrad_plugins.sweep.attempt import COMMAND, Worker
 from crossgrad_plugins.sweep.job import Job
 from crossgrad_plugins.sweep.machine import Machine
 
-#: Name -> module with its function `carry_out`.
+#: Name of an engine -> module with its function `carry_out`.
 ENGINES: Final = {
     "local": "crossgrad_plugins.sweep.engines.local",
     "ray": "crossgrad_plugins.sweep.engines.ray",
@@ -24,7 +24,7 @@ ENGINES: Final = {
 
 @dataclass
 class Stop:
-    """The stop requests of the user.
+    """The user's requests to stop.
 
     Attributes:
         count: Number of requests.
@@ -35,19 +35,21 @@ class Stop:
 
 @dataclass(frozen=True)
 class Work:
-    """The arguments of an engine.
+    """The arguments for an engine.
 
     Attributes:
         jobs: The runs, in order.
         out: Folder of the sweep, visible on all machines.
-        folder: Working folder of the runs, visible on all machines.
-        threads: Threads per run.
-        workers: Number of runs in parallel; None means that the engine decides.
-        memory: Maximum memory of a run, GiB; None means that the engine decides.
+        folder: Current folder of the runs, visible on all machines.
+        threads: Number of threads per run.
+        workers: Number of runs at the same time; None lets the engine choose.
+        memory: Maximum memory of a run, GiB; None lets the engine choose.
         options: Options of the engine as the user gave them.
-        machine: The division of this machine; None for an engine that runs elsewhere.
-        stop: The stop requests of the user.
-        command: The command that trains a run; core numbers and arguments of `crossgrad` follow.
+        machine: Cores and memory of each worker on this machine; None for an engine on other
+            machines.
+        stop: The user's requests to stop.
+        command: The command that trains a run; core numbers and the arguments of `crossgrad` are
+            appended.
     """
 
     jobs: Sequence[Job]
@@ -62,12 +64,12 @@ class Work:
     command: tuple[str, ...] = COMMAND
 
     def worker(self, name: str, cores: tuple[int, ...] = (), memory: int | None = None) -> Worker:
-        """Return a worker that carries out runs of this work.
+        """Return a worker that executes runs.
 
         Args:
             name: Name of the worker.
-            cores: Numbers of the worker's cores; empty means any cores.
-            memory: Maximum memory of a run in bytes; None means the limit of the user.
+            cores: Numbers of the cores of this worker; if empty, any core is used.
+            memory: Maximum memory of a run in bytes; None for the user's limit.
         """
         if memory is None and self.memory is not None:
             memory = int(self.memory * 2**30)
@@ -75,23 +77,24 @@ class Work:
 
 
 class Engine(Protocol):
-    """The function `carry_out` of an engine's module."""
+    """The type of the function `carry_out` in the module of an engine."""
 
     def __call__(self, work: Work) -> Iterator[None]:
-        """Carry out runs; their folders and records hold the results.
+        """Execute runs; their folders and records contain the results.
 
-        The function yields several times a second, so that the sweep can show its progress. A run
-        whose process or machine died is tried again; a run that failed is not tried again. When
-        `work.stop.count` is above zero, no run is started, and active runs stop with a checkpoint.
+        The function yields several times per second, so that the sweep can show its progress. A run
+        is started again if its process or machine died. It is not started again if it failed. After
+        `work.stop.count` becomes positive, no run is started, and active runs stop with a
+        checkpoint.
 
         Raises:
-            UserError: The engine, one of its options, or its cluster is missing; no run started.
+            UserError: The engine, its cluster or one of its options is missing; no run was started.
         """
         ...
 
 
 def check_options(name: str, options: Iterable[str]) -> None:
-    """Refuse options that an engine does not have.
+    """Refuse options that the engine does not have.
 
     Raises:
         UserError: An option is unknown; the message lists unknown and known options.
@@ -110,6 +113,6 @@ def check_options(name: str, options: Iterable[str]) -> None:
 
 
 def engine(name: str) -> Engine:
-    """Import the engine with the given name."""
+    """Import the engine with a given name."""
     carry_out: Engine = import_module(ENGINES[name]).carry_out
     return carry_out

@@ -13,7 +13,7 @@ OPTIONS: Final = ()
 
 
 def carry_out(work: Work) -> Iterator[None]:
-    """Carry out runs, each in its own process that is pinned to its worker's cores."""
+    """Execute each run in a separate process on the cores of its worker."""
     crew = _WorkerPool(work)
     while crew.is_busy():
         crew.look()
@@ -25,7 +25,7 @@ class _WorkerPool:
     """The workers of this machine.
 
     Args:
-        work: The arguments of the engine.
+        work: The arguments for the engine.
     """
 
     def __init__(self, work: Work) -> None:
@@ -37,11 +37,11 @@ class _WorkerPool:
         self._asked = Counter[Attempt]()
 
     def is_busy(self) -> bool:
-        """Return True if runs are active or must still be started."""
+        """Return True if runs are active or waiting."""
         return bool(self._under_way) or bool(self._waiting and not self._work.stop.count)
 
     def look(self) -> None:
-        """Handle ended runs, and start runs on free workers."""
+        """Process the results of ended runs, and start runs on free workers."""
         for attempt in list(self._under_way):
             while self._asked[attempt] < self._work.stop.count:
                 self._asked[attempt] += 1
@@ -61,7 +61,7 @@ class _WorkerPool:
             self._under_way.append(Attempt(job, self._free.pop()))
 
     def _next(self) -> Job | None:
-        """Return the first run whose folder no process of an earlier sweep uses."""
+        """Return the first waiting run whose folder no process of an earlier sweep uses."""
         worker = self._free[-1]
         return next((job for job in self._waiting if is_free(job, worker)), None)
 

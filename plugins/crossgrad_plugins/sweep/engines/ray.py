@@ -1,6 +1,7 @@
-"""The engine for a Ray cluster: each run is one task; if a machine is lost, only time is lost.
+"""The engine for a Ray cluster: each run is one task.
 
-Options: `address` of the cluster (default: RAY_ADDRESS, else this machine).
+If a machine is lost, its tasks are repeated. The option `address` gives the address of the cluster
+(default: RAY_ADDRESS, or else this machine).
 """
 
 import logging
@@ -17,14 +18,14 @@ from crossgrad_plugins.sweep.engines import Work
 from crossgrad_plugins.sweep.job import Job
 
 OPTIONS: Final = ("address",)
-#: Maximum number of seconds of one wait for tasks that have ended.
+#: Maximum number of seconds of one wait for ended tasks.
 _PAUSE = 0.25
-#: Number of seconds in which a cluster must answer.
+#: Number of seconds within which a cluster must answer.
 _PATIENCE = 10.0
 
 
 def carry_out(work: Work) -> Iterator[None]:
-    """Carry out runs as tasks; if a machine is lost, Ray repeats its tasks."""
+    """Execute runs as tasks; Ray repeats the tasks of a lost machine."""
     ray = _connected(work)
     try:
         crew = _WorkerPool(work, ray)
@@ -39,8 +40,8 @@ class _WorkerPool:
     """The tasks of a sweep.
 
     Args:
-        work: The arguments of the engine.
-        ray: The library, connected.
+        work: The arguments for the engine.
+        ray: The imported library, connected to the cluster.
     """
 
     def __init__(self, work: Work, ray: ModuleType) -> None:
@@ -55,11 +56,11 @@ class _WorkerPool:
         self._task = ray.remote(scheduling_strategy="SPREAD", **needs)(_carried_out)
 
     def is_busy(self) -> bool:
-        """Return True if runs are active or must still be started."""
+        """Return True if runs are active or waiting."""
         return bool(self._under_way) or bool(self._waiting and not self._work.stop.count)
 
     def look(self) -> None:
-        """Submit runs, and handle ended runs."""
+        """Submit runs, and process the results of ended runs."""
         work, most = self._work, self._work.workers
         while self._waiting and not work.stop.count and len(self._under_way) < (most or 10**6):
             job = self._waiting.popleft()
@@ -85,7 +86,7 @@ class _WorkerPool:
 
 
 def _carried_out(job: Job, worker: Worker) -> Outcome:
-    """Carry out a run as a task; the worker is named after its machine and process."""
+    """Execute a run as a task; the worker's name contains its machine and process."""
     import os
 
     import ray
@@ -116,7 +117,7 @@ def _connected(work: Work) -> ModuleType:
             found=" ".join(str(error).split()),
             todo="start it with `ray start --head`, and give the address that it prints",
         ) from error
-    # Restore the signal handlers, because Ray installs its own.
+    # Restore the signal handlers, because Ray installs other handlers.
     for number, handler in handlers.items():
         signal.signal(number, handler)
     module: ModuleType = ray
@@ -124,7 +125,10 @@ def _connected(work: Work) -> ModuleType:
 
 
 def _ping(address: str | None) -> None:
-    """Raise an OSError within seconds if the cluster does not answer; Ray waits for minutes."""
+    """Raise an OSError within seconds if the cluster does not answer.
+
+    Ray itself would wait for minutes.
+    """
     host, colon, port = (address or "").removeprefix("ray://").rpartition(":")
     if colon and port.isdecimal():
         socket.create_connection((host, int(port)), timeout=_PATIENCE).close()

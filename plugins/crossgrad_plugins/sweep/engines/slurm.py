@@ -1,7 +1,7 @@
-"""The engine for a Slurm cluster, which uses submitit: each run is one job.
+"""The engine for a Slurm cluster, through submitit: each run is one job.
 
-Options: `cluster` (slurm, or local to test it on this machine), `time` in minutes (1440), and these
-options of sbatch: `partition`, `account`, `qos`, `constraint`, `exclude`, `nodelist`, `gres`,
+Options: `cluster` (slurm, or local for a test on this machine), `time` in minutes (1440), and the
+sbatch options `partition`, `account`, `qos`, `constraint`, `exclude`, `nodelist`, `gres`,
 `comment`.
 """
 
@@ -16,7 +16,7 @@ from crossgrad_plugins.sweep.attempt import Outcome, Retries, Worker, carried_ou
 from crossgrad_plugins.sweep.engines import Work
 from crossgrad_plugins.sweep.job import Job
 
-#: Options that the sweep passes to sbatch unchanged.
+#: Options that are passed to sbatch unchanged.
 SBATCH: Final = (
     *("partition", "account", "qos", "constraint", "exclude", "nodelist", "gres", "comment"),
 )
@@ -26,12 +26,12 @@ _NAME: Final = "crossgrad"
 _TIME: Final = 1440
 #: Seconds between two checks of the jobs.
 _PAUSE: Final = 0.5
-#: Default number of parallel jobs of one array.
+#: Default number of jobs of an array that run at the same time.
 _MOST: Final = 256
 
 
 def carry_out(work: Work) -> Iterator[None]:
-    """Carry out runs as jobs; a preempted job continues when Slurm starts it again."""
+    """Execute runs as jobs; after preemption, a job continues when Slurm starts it again."""
     crew = _WorkerPool(work)
     while crew.is_busy():
         crew.look()
@@ -40,7 +40,7 @@ def carry_out(work: Work) -> Iterator[None]:
 
 
 def script(work: Work) -> str:
-    """Return the sbatch script of the whole sweep."""
+    """Return the sbatch script that runs the whole sweep."""
     _submitit()
     from submitit.slurm.slurm import _convert_mem, _make_sbatch_string
 
@@ -64,24 +64,24 @@ def script(work: Work) -> str:
 
 
 class Task:
-    """A run as a Slurm job; submitit submits the job again if Slurm preempts it.
+    """A run as a Slurm job; submitit submits the job again after preemption.
 
     Args:
         job: The run.
-        worker: The worker that carries out the run.
+        worker: The worker that executes the run.
     """
 
     def __init__(self, job: Job, worker: Worker) -> None:
         self.job, self.worker = job, worker
 
     def __call__(self) -> Outcome:
-        """Carry out the run."""
+        """Execute the run."""
         import submitit
 
         return carried_out(self.job, self.worker, f"slurm-{submitit.JobEnvironment().job_id}")
 
     def checkpoint(self) -> object:
-        """Return the job that continues after preemption from the checkpoint of the run."""
+        """Return the job that continues from the checkpoint of the run after preemption."""
         import submitit
 
         return submitit.helpers.DelayedSubmission(self)
@@ -91,14 +91,15 @@ class _WorkerPool:
     """The jobs of a sweep.
 
     Args:
-        work: The arguments of the engine.
+        work: The arguments for the engine.
     """
 
     def __init__(self, work: Work) -> None:
         self._work = work
         self._submitit = _submitit()
         self._executor = _executor(work, self._submitit)
-        # Only Slurm has a queue. Other clusters start all submitted jobs at once.
+        # Only Slurm has a queue. submitit starts all jobs of other clusters at once, so the number
+        # of submitted jobs is limited here.
         queued = self._executor.cluster == "slurm"
         self._most = len(work.jobs) if queued else work.workers or 1
         self._waiting = deque(work.jobs)
@@ -107,11 +108,11 @@ class _WorkerPool:
         self._asked = 0
 
     def is_busy(self) -> bool:
-        """Return True if runs are active or must still be started."""
+        """Return True if runs are active or waiting."""
         return bool(self._under_way) or bool(self._waiting and not self._work.stop.count)
 
     def look(self) -> None:
-        """Submit runs, and handle ended runs."""
+        """Submit runs, and process the results of ended runs."""
         stop = self._work.stop
         if self._waiting and not stop.count:
             self._hand_in()
@@ -165,7 +166,7 @@ def _executor(work: Work, submitit: ModuleType) -> Any:  # noqa: ANN401 - an exe
 
 
 def _general(work: Work) -> dict[str, Any]:
-    """Return the parameters that every executor of submitit accepts."""
+    """Return the parameters that all executors of submitit accept."""
     parameters: dict[str, Any] = {
         "name": _NAME,
         "timeout_min": _minutes(work),

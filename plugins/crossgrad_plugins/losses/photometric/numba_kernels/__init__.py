@@ -1,1 +1,1 @@
-"""Kernels of the fused loss."""
+"""Compiled kernels of the photometric loss."""

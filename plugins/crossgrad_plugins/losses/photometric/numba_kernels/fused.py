@@ -1,20 +1,21 @@
 """The photometric loss and its gradient in one pass over the image (Numba, CPU, float32).
 
-x is the image and y the target; s = x + y and d = x - y. With s and d, SSIM needs four windowed
-means instead of five: M_s, M_d, E[s^2], E[d^2]. The factors of this form have no cancellation
-between the two images:
+Let x be the image, y the target, s = x + y and d = x - y. With s and d, SSIM needs only four
+windowed means (M_s, M_d, E[s^2], E[d^2]) instead of five. In this form, the factors do not subtract
+values of the two images from each other:
 
     SSIM = (M_s^2 - M_d^2 + 2 C1) (V_s - V_d + 2 C2) / ((M_s^2 + M_d^2 + 2 C1) (V_s + V_d + 2 C2)),
 
-with V = E[.^2] - M^2. The gradient is G * a + s (G * b) + d (G * c). G * is a convolution with the
-same window; a, b, c are the derivatives with respect to M_s + M_d, V_s and V_d. In smooth parts of
-an image, variances are differences of nearly equal numbers. Therefore s and d are taken relative to
-a centre, their mean over the tile (per channel).
+with V = E[.^2] - M^2. The gradient is G * a + s (G * b) + d (G * c), with the derivatives a, b, c
+with respect to M_s + M_d, V_s and V_d. G * is a convolution with the window of SSIM. In smooth
+parts of an image, a variance is the difference of two nearly equal numbers. The kernel therefore
+subtracts from s and d their means over the tile, per channel.
 
-The image is divided into tiles whose size depends only on the image's size. A tile is processed row
-by row with ring buffers of sixteen rows (s, d, mask; a, b, c). The working set therefore stays in
-the second-level cache, and memory does not grow with the image. Every tile recomputes its halo, so
-that tiles are independent and the result has the same bits for any number of threads.
+The image is divided into tiles whose size depends only on the size of the image. A tile is
+processed row by row with ring buffers of sixteen rows, for s, d and mask, and for a, b and c. All
+data of a tile therefore fit into the second-level cache, and memory does not grow with the image.
+Every tile recomputes the rows around it, so that tiles are independent. The result then has the
+same bits for any number of threads.
 """
 
 from typing import TypeAlias
@@ -52,9 +53,9 @@ from crossgrad_plugins.losses.photometric.numba_kernels.terms import (
 )
 from crossgrad_plugins.losses.photometric.reference import RADIUS
 
-_Floats: TypeAlias = NDArray[np.float32]  # 1-D
-_Bytes: TypeAlias = NDArray[np.uint8]  # 1-D
-_Flags: TypeAlias = NDArray[np.bool_]  # 1-D
+_Floats: TypeAlias = NDArray[np.float32]
+_Bytes: TypeAlias = NDArray[np.uint8]
+_Flags: TypeAlias = NDArray[np.bool_]
 _Box: TypeAlias = tuple[int, int, int, int]  # first row, end row, first column, end column
 
 
@@ -64,14 +65,15 @@ def _tile(
     mask: _Flags, is_masked: bool, gradient: _Floats, with_gradient: bool,
     box: _Box, height: int, width: int, l1_weight: np.float32, ssim_weight: np.float32,
 ) -> tuple[float, float]:  # fmt: skip
-    """Return the sums of |x - y| and 1 - SSIM over a tile; write its gradient to `gradient`."""
+    """Return the sums of |x - y| and 1 - SSIM over a tile, and write the gradient."""
     top, bottom, left, right = box
     columns = right - left
     halo = RADIUS if with_gradient else 0
     absolute, dissimilarity = 0.0, 0.0
     set_centres(scratch, image, target, target_8bit, is_8bit, mask, is_masked, box, width)
     loaded = top - halo - RADIUS
-    # Rows are processed in pairs. The second row of the last pair may be unused.
+    # Rows are processed in pairs. If the number of rows is odd, the second row of the last pair is
+    # not used.
     for first in range(top - halo, bottom + halo, 2):
         while loaded <= first + 1 + RADIUS:
             load_row(
@@ -107,7 +109,7 @@ def _all_tiles(
     height: int, width: int, l1_weight: np.float32, ssim_weight: np.float32,
     sums: NDArray[np.float64],
 ) -> None:  # fmt: skip
-    """Process every tile; write the sums [rows of tiles, columns of tiles, 2]."""
+    """Process every tile, and write the sums [rows of tiles, columns of tiles, 2]."""
     down, across = sums.shape[0], sums.shape[1]
     rows, columns = (height + down - 1) // down, (width + across - 1) // across
     tiles = down * across
@@ -136,15 +138,15 @@ def loss_terms(
     gradient: NDArray[np.float32] | None = None,
     ssim_weight: float = 0.2,
 ) -> tuple[float, float]:
-    """Return the means of |x - y| and of 1 - SSIM over the unmasked pixels; write the gradient.
+    """Return the means of |x - y| and of 1 - SSIM over unmasked pixels, and write the gradient.
 
     Args:
-        image: [H, W, 3], C-contiguous.
-        target: [H, W, 3], C-contiguous; 8-bit values are divided by 255.
-        mask: [H, W], True where the pixel counts; None counts all pixels.
-        gradient: [H, W, 3], C-contiguous, receives the gradient of (1 - w) * L1 + w * (1 - SSIM);
-            None omits its computation.
-        ssim_weight: w.
+        image: [H, W, 3] the render, C-contiguous.
+        target: [H, W, 3] the photo, C-contiguous; 8-bit values are divided by 255.
+        mask: [H, W] True for pixels that count; None if all pixels count.
+        gradient: [H, W, 3] C-contiguous output: the gradient of (1 - w) * L1 + w * (1 - SSIM); if
+            None, the gradient is not computed.
+        ssim_weight: The weight w.
 
     Returns: L1 and 1 - SSIM; both are 0 if no pixel counts.
     """

@@ -1,6 +1,7 @@
-"""The rows of a tile: memory layout, loading into ring buffers, sums over the 11-wide window.
+"""The rows of a tile: memory layout, loading into ring buffers, sums over windows of 11 pixels.
 
-Rows are interleaved, [column * 3 + channel], so adjacent columns are three floats apart.
+The channels of a row are interleaved, [column * 3 + channel], so adjacent columns are three floats
+apart.
 """
 
 from typing import TypeAlias
@@ -25,40 +26,40 @@ from crossgrad_plugins.losses.photometric.reference import RADIUS, WINDOW, gauss
 
 TILE_ROWS = 64
 TILE_COLUMNS = 384
-#: Number of rows of a ring buffer. It is a power of two and larger than WINDOW, because the windows
-#: of two rows overlap.
+#: Number of rows of a ring buffer. The number is a power of two and larger than WINDOW, because the
+#: windows of two consecutive rows are in the buffer together.
 SLOTS = 16
 CHANNELS = 3
-#: Number of floats by which a window extends beyond its centre column.
+#: Number of floats from the centre column of a window to its edge.
 HALO = CHANNELS * RADIUS
-# Number of floats for a tile with twice the halo on both sides, and for vectors that start before
-# its end.
+# Number of floats per row: a tile with twice the window's radius on both sides, and the rest of the
+# last vector.
 _ROOM = CHANNELS * TILE_COLUMNS + 4 * HALO + CHANNELS * WINDOW + 3 * WIDE
 STRIDE = _ROOM + -_ROOM % WIDE
-#: Position of the ring buffer of s - centre.
+#: Position of the ring buffer with s minus its mean.
 SUM = 0
-#: Position of the ring buffer of d - centre.
+#: Position of the ring buffer with d minus its mean.
 DIFFERENCE = SUM + SLOTS * STRIDE
-#: Position of the ring buffer of the mask: 1 for a pixel that counts, else 0.
+#: Position of the ring buffer with the mask: 1 for a pixel that counts, else 0.
 KEEP = DIFFERENCE + SLOTS * STRIDE
-#: Position of s, s^2, d and d^2 of two rows after the vertical filter.
+#: Position of two rows of s, s^2, d and d^2 after the vertical filter.
 PARTIAL = KEEP + SLOTS * STRIDE
-#: Position of the ring buffers of a, b and c.
+#: Position of the ring buffers with a, b and c.
 BY_MEAN = PARTIAL + 8 * STRIDE
 BY_SUM_VARIANCE = BY_MEAN + SLOTS * STRIDE
 BY_DIFFERENCE_VARIANCE = BY_SUM_VARIANCE + SLOTS * STRIDE
-#: Position of a, b and c of two rows after the vertical filter.
+#: Position of two rows of a, b and c after the vertical filter.
 BACK = BY_DIFFERENCE_VARIANCE + SLOTS * STRIDE
 #: Position of one row of results.
 LINE = BACK + 6 * STRIDE
-#: Positions of the centres that are subtracted from s and from d.
+#: Positions of the means that are subtracted from s and from d.
 CENTRE_SUM = LINE + STRIDE
 CENTRE_DIFFERENCE = CENTRE_SUM + STRIDE
-#: Total number of floats.
+#: Total number of floats of the memory.
 SCRATCH = CENTRE_DIFFERENCE + STRIDE
-_Floats: TypeAlias = NDArray[np.float32]  # 1-D
-_Bytes: TypeAlias = NDArray[np.uint8]  # 1-D
-_Flags: TypeAlias = NDArray[np.bool_]  # 1-D
+_Floats: TypeAlias = NDArray[np.float32]
+_Bytes: TypeAlias = NDArray[np.uint8]
+_Flags: TypeAlias = NDArray[np.bool_]
 _Box: TypeAlias = tuple[int, int, int, int]  # first row, end row, first column, end column
 _ZERO, _ONE = np.float32(0), np.float32(1)
 _WHITE = np.float32(255)
@@ -69,13 +70,13 @@ def set_centres(
     scratch: _Floats, image: _Floats, target: _Floats, target_8bit: _Bytes, is_8bit: bool,
     mask: _Flags, is_masked: bool, box: _Box, width: int,
 ) -> None:  # fmt: skip
-    """Write the centres: per channel, means of s and d over every eighth row of the tile.
+    """Write the means of s and d per channel, over every eighth row of the tile.
 
-    x and y are clipped to [0, 1].
+    x and y are clipped to [0, 1] for these means.
     """
     top, bottom, left, right = box
     for channel in range(CHANNELS):
-        count = 1e-9  # If no pixel counts, this divisor makes the centres 0.
+        count = 1e-9  # If no pixel counts, this divisor makes the means 0.
         sum_x, sum_y = 0.0, 0.0
         for row in range(top, bottom, 8):
             for column in range(left, right):
@@ -84,7 +85,7 @@ def set_centres(
                 count += 1.0
                 i = (row * width + column) * CHANNELS + channel
                 y = np.float32(target_8bit[i]) / _WHITE if is_8bit else target[i]
-                # With this order of arguments, a NaN counts as 0.
+                # With the arguments in this order, a NaN counts as 0.
                 sum_x += float(min(max(_ZERO, image[i]), _ONE))
                 sum_y += float(min(max(_ZERO, y), _ONE))
         centre_sum = np.float32((sum_x + sum_y) / count)
@@ -94,7 +95,7 @@ def set_centres(
             scratch[CENTRE_DIFFERENCE + j] = centre_difference
 
 
-# Give loops views that start at index 0, because LLVM does not vectorise indices that can be
+# Pass views that start at index 0 to the loops, because LLVM does not vectorise indices that can be
 # negative.
 
 
@@ -127,7 +128,7 @@ def _copy_8bit(
 def _copy_mask(
     destination: _Floats, start: int, mask: _Flags, mask_start: int, pixels: int
 ) -> None:
-    """Write each pixel's mask as 0 or 1, once per channel."""
+    """Write the mask of each pixel as 0 or 1, once for each channel."""
     view, values = destination[start : start + CHANNELS * pixels], mask[mask_start:]
     for pixel in range(pixels):
         keep = np.float32(values[pixel])
@@ -139,11 +140,11 @@ def load_row(
     scratch: _Floats, image: _Floats, target: _Floats, target_8bit: _Bytes, is_8bit: bool,
     mask: _Flags, is_masked: bool, row: int, box: _Box, height: int, width: int,
 ) -> None:  # fmt: skip
-    """Load s, d (relative to their centres) and the mask of a row into the rings.
+    """Load s and d, minus their means, and the mask of a row into the ring buffers.
 
-    Outside the image and at masked pixels, both images are 0.
+    Outside the image and at masked pixels, the values of both images are 0.
     """
-    # Float column of the image that is at column 0 of the ring buffer
+    # Index of the float in the image row that belongs to column 0 of the ring buffer
     first = CHANNELS * (box[2] - 2 * RADIUS)
     count = CHANNELS * (box[3] - box[2] + 4 * RADIUS)
     slot = (row & (SLOTS - 1)) * STRIDE
@@ -151,7 +152,7 @@ def load_row(
     begin, end = 0, 0
     if 0 <= row < height:
         begin, end = max(0, -first), min(count, CHANNELS * width - first)
-    # Load x and y first. Then s and d replace them in place.
+    # First load x and y. Then replace them by s and d in place.
     for ring in (s, d, keep):
         fill(scratch, ring, begin, _ZERO)
         fill(scratch, ring + end, count - end, _ZERO)
@@ -182,7 +183,7 @@ _W0, _W1, _W2, _W3, _W4, _W5 = (np.float32(w) for w in gaussian_window().numpy()
 
 @device
 def across(array: _Floats, start: int) -> Lanes:
-    """Return the window sum over eleven columns; the first column is at element `start`."""
+    """Return the window sum over eleven columns, starting with element `start`."""
     total = load_wide(array, start + 5 * CHANNELS) * splat_wide(_W5)
     pair = load_wide(array, start + 4 * CHANNELS) + load_wide(array, start + 6 * CHANNELS)
     total = fma(pair, splat_wide(_W4), total)
@@ -198,13 +199,13 @@ def across(array: _Floats, start: int) -> Lanes:
 
 @device
 def _tap(ring: _Floats, start: int, row: int) -> Lanes:
-    """Return column `start` of a row of the ring."""
+    """Return the values of a row in the ring buffer from column `start` on."""
     return load_wide(ring, start + (row & _LAST) * STRIDE)
 
 
 @device
 def _taps(ring: _Floats, start: int, row: int) -> _Taps:
-    """Return the twelve rows that the windows around `row` and around the next row contain."""
+    """Return the twelve rows that belong to the windows around `row` and around the next row."""
     return (
         _tap(ring, start, row - 5),
         _tap(ring, start, row - 4),
@@ -226,7 +227,7 @@ def _sum(
     a: Lanes, b: Lanes, c: Lanes, d: Lanes, e: Lanes, middle: Lanes,
     f: Lanes, g: Lanes, h: Lanes, i: Lanes, j: Lanes,
 ) -> Lanes:  # fmt: skip
-    """Return the window sum of eleven rows."""
+    """Return the weighted sum of eleven rows."""
     total = middle * splat_wide(_W5)
     total = fma(e + f, splat_wide(_W4), total)
     total = fma(d + g, splat_wide(_W3), total)
@@ -240,7 +241,7 @@ def _sum_squares(
     a: Lanes, b: Lanes, c: Lanes, d: Lanes, e: Lanes, middle: Lanes,
     f: Lanes, g: Lanes, h: Lanes, i: Lanes, j: Lanes,
 ) -> Lanes:  # fmt: skip
-    """Return the window sum of the squares of eleven rows."""
+    """Return the weighted sum of the squares of eleven rows."""
     total = middle * middle * splat_wide(_W5)
     total = fma(fma(e, e, f * f), splat_wide(_W4), total)
     total = fma(fma(d, d, g * g), splat_wide(_W3), total)
@@ -251,15 +252,15 @@ def _sum_squares(
 
 @device
 def down(ring: _Floats, start: int, row: int) -> tuple[Lanes, Lanes]:
-    """Return the window sums over the rows of a ring, around `row` and around the next row.
+    """Return the window sums over rows of a ring buffer, around `row` and around the next row.
 
-    Both sums are computed together, because they share most of their data, which comes from the
-    second-level cache.
+    Both sums are computed together, because they need nearly the same data from the second-level
+    cache.
 
     Args:
         ring: Ring buffer of `SLOTS` rows.
-        start: Element at which the column begins.
-        row: Number of a row.
+        start: Index of the first element of the column.
+        row: Number of the first row.
     """
     a, b, c, d, e, f, g, h, i, j, k, last = _taps(ring, start, row)
     return (
@@ -272,7 +273,7 @@ def down(ring: _Floats, start: int, row: int) -> tuple[Lanes, Lanes]:
 def down_with_squares(ring: _Floats, start: int, row: int) -> tuple[Lanes, Lanes, Lanes, Lanes]:
     """Like `down`, but return the sums of values and of squares.
 
-    The first two results are for `row`, the last two for the next row.
+    The first two results belong to `row`, the last two to the next row.
     """
     a, b, c, d, e, f, g, h, i, j, k, last = _taps(ring, start, row)
     return (

@@ -30,7 +30,7 @@ from crossgrad_plugins.losses.photometric.numba_kernels.rows import (
 )
 from crossgrad_plugins.losses.photometric.reference import C1, C2, RADIUS
 
-_Floats: TypeAlias = NDArray[np.float32]  # 1-D
+_Floats: TypeAlias = NDArray[np.float32]
 
 _ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
 _TWICE_C1, _TWICE_C2 = np.float32(2 * C1), np.float32(2 * C2)
@@ -38,7 +38,7 @@ _TWICE_C1, _TWICE_C2 = np.float32(2 * C1), np.float32(2 * C2)
 
 @part
 def sum_rows(scratch: _Floats, row: int, columns: int) -> None:
-    """Sum s, s^2, d and d^2 down the columns, around a row and around the next row."""
+    """Sum s, s^2, d and d^2 over the windows around a row and around the next row."""
     for j in range(0, CHANNELS * (columns + 4 * RADIUS), WIDE):
         values, squares, next_values, next_squares = down_with_squares(scratch, SUM + j, row)
         store(scratch, PARTIAL + j, values)
@@ -54,9 +54,9 @@ def sum_rows(scratch: _Floats, row: int, columns: int) -> None:
 
 @part
 def ssim_row(scratch: _Floats, row: int, columns: int, partial: int) -> None:
-    """Write 1 - SSIM of a row to the line, and a, b, c to their rings.
+    """Write 1 - SSIM of a row to the output line, and a, b, c to their ring buffers.
 
-    The values are 0 for pixels that do not count. The column sums of the row begin at element
+    Pixels that do not count get the value 0. The vertical sums of this row begin at element
     `partial`.
     """
     slot = (row & (SLOTS - 1)) * STRIDE
@@ -68,7 +68,7 @@ def ssim_row(scratch: _Floats, row: int, columns: int, partial: int) -> None:
         local_d = across(scratch, partial + 2 * STRIDE + j)
         variance_s = fnma(local_s, local_s, across(scratch, partial + STRIDE + j))
         variance_d = fnma(local_d, local_d, across(scratch, partial + 3 * STRIDE + j))
-        # Rounding may make a variance of zero slightly negative.
+        # Rounding can make a variance of zero slightly negative.
         variance_s = where(zero < variance_s, variance_s, zero) + twice_c2
         variance_d = where(zero < variance_d, variance_d, zero)
         mean_s = local_s + load_wide(scratch, CENTRE_SUM + j)
@@ -77,8 +77,8 @@ def ssim_row(scratch: _Floats, row: int, columns: int, partial: int) -> None:
         dark = mean_d * mean_d
         over_mean = one / (bright + dark)
         over_variance = one / (variance_s + variance_d)
-        # 1 minus the luminance term, and 1 minus the contrast-structure term. Both are exactly 0 if
-        # x = y.
+        # One minus the luminance term, and one minus the contrast-structure term. Both values are
+        # exactly 0 if x = y.
         luminance_loss = two * dark * over_mean
         contrast_loss = two * variance_d * over_variance
         dissimilarity = fnma(luminance_loss, contrast_loss, luminance_loss + contrast_loss)
@@ -100,7 +100,7 @@ def ssim_row(scratch: _Floats, row: int, columns: int, partial: int) -> None:
 
 @part
 def clear_row(scratch: _Floats, row: int, columns: int) -> None:
-    """Set a, b, c of a row outside the image to 0."""
+    """Set a, b and c of a row outside the image to 0."""
     slot = (row & (SLOTS - 1)) * STRIDE
     for ring in (BY_MEAN, BY_SUM_VARIANCE, BY_DIFFERENCE_VARIANCE):
         fill(scratch, ring + slot, CHANNELS * (columns + 2 * RADIUS), _ZERO)
@@ -108,7 +108,7 @@ def clear_row(scratch: _Floats, row: int, columns: int) -> None:
 
 @part
 def sum_gradient_rows(scratch: _Floats, row: int, columns: int) -> None:
-    """Sum a, b and c down the columns, around a row and around the next row."""
+    """Sum a, b and c over the windows around a row and around the next row."""
     for j in range(0, CHANNELS * (columns + 2 * RADIUS), WIDE):
         this, below = down(scratch, BY_MEAN + j, row)
         store(scratch, BACK + j, this)
@@ -130,9 +130,9 @@ def gradient_row(
     l1_weight: np.float32,
     ssim_weight: np.float32,
 ) -> None:
-    """Write the gradient of the loss for a row of the tile to the line.
+    """Write the gradient of the loss for a row of the tile to the output line.
 
-    The column sums of the row begin at element `back`.
+    The vertical sums of this row begin at element `back`.
     """
     slot = (row & (SLOTS - 1)) * STRIDE + 2 * HALO
     zero, plus, weight = splat_wide(_ZERO), splat_wide(l1_weight), splat_wide(ssim_weight)
@@ -163,7 +163,8 @@ def sum_of(array: _Floats, start: int, count: int) -> float:
 def sum_absolute(scratch: _Floats, start: int, count: int) -> float:
     """Return the sum of |d| over `count` elements from `start` on.
 
-    The centres are added first. The element at `start` is the first channel of a pixel.
+    The subtracted means are added to d before. The element at `start` must be the first channel of
+    a pixel.
     """
     view, centre = scratch[start : start + count], scratch[CENTRE_DIFFERENCE:]
     total = 0.0

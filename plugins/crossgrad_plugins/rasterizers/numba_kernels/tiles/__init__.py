@@ -1,1 +1,1 @@
-"""Kernels over the pixels of tiles: forward, backward, and the parts that both passes share."""
+"""Kernels over the pixels of tiles: forward pass, backward pass, and common parts."""

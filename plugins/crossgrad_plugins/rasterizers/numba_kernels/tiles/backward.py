@@ -1,14 +1,16 @@
-"""Gradients of the tiles' pixels, summed per entry (a Gaussian in a tile), front to back.
+"""Gradients of the pixels, summed per Gaussian and tile, from front to back.
 
-Let S be the contribution of all Gaussians behind the current Gaussian to the linearised loss. The
-start value of S is the pixel's gradient times the pixel's value. c is the gradient times the
-Gaussian's colour. Then
+Let S be the part of the linearised loss that comes from all Gaussians behind the current one. At
+the start, S is the gradient of the pixel times the value of the pixel. Let c be the gradient of the
+pixel times the colour of the Gaussian, and T the transmittance. Then the derivative of the loss L
+is
 
-    dL/d(alpha) = T c - S / (1 - alpha),
+    dL/d(alpha) = T c - S / (1 - alpha).
 
-so one pass in drawing order is enough, and the transmittance T has the same bits as in the forward
-pass. A gradient of the accumulated opacity only reduces the start value of S: by this gradient
-times the final transmittance. The accumulated depth is treated as one more colour channel.
+One pass from front to back is therefore enough, and T has the same bits as in the forward pass. A
+gradient with respect to the accumulated opacity only changes the start value of S: this gradient
+times the final transmittance is subtracted. The accumulated depth is treated like a fourth colour
+channel.
 """
 
 import numpy as np
@@ -99,12 +101,12 @@ from crossgrad_plugins.rasterizers.numba_kernels.tiles.pixel_states import (
     start_tile,
 )
 
-#: Values of a patch, WIDE numbers each: alpha and the odds of alpha. Later, the gradient with
-#: respect to the exponent replaces alpha.
+#: Values of a patch, WIDE numbers each: alpha, and the odds alpha / (1 - alpha). Later, the
+#: gradient with respect to the exponent replaces alpha.
 _ALPHA, _ODDS = 0, WIDE
 _RESPONSE = 2 * WIDE
 
-#: Number of entries whose row buffers are filled before the first of them is processed.
+#: Number of entries whose row buffers are filled before the first entry is processed.
 BATCH = 8
 
 
@@ -119,10 +121,10 @@ def _respond(
     capped: NDArray[np.float32] | None,
     responses: NDArray[np.float32],
 ) -> None:
-    """Write the plain response in patches, one patch after another.
+    """Write alpha and odds of the plain response for several patches.
 
-    This is a separate loop, because the response does not depend on the transmittance that the
-    previous Gaussian leaves in a patch. So the processor can work on several patches at once.
+    This loop is separate, because alpha does not depend on the transmittance that earlier Gaussians
+    leave. The processor can therefore work on several patches at the same time.
     """
     decay = broadcast_wide(records, record + DECAY)
     terms = terms_of(constants)
@@ -136,8 +138,8 @@ def _respond(
         dx = offsets - broadcast_four_wide(rows, row + ROW_CENTRE)
         power = fnma(decay * dx, dx, broadcast_four_wide(rows, row + ROW_EXPONENT))
         touched = power >= load_wide(constants, TOUCHED)
-        # If a pixel is not touched, alpha is undefined and possibly NaN. Select values by a mask
-        # and never multiply them by 0.
+        # If a pixel is not touched, alpha is undefined and may be NaN. Select values by a mask,
+        # because a multiplication by 0 would keep the NaN.
         alpha = smaller(exp2(power, terms), load_wide(constants, LARGEST_ALPHA))
         alpha = where(touched, alpha, zero)
         store(responses, at + _ALPHA, alpha)
@@ -159,12 +161,12 @@ def _blend(
     capped: NDArray[np.float32] | None,
     responses: NDArray[np.float32],
 ) -> tuple[Lanes, Lanes, Lanes, Lanes]:
-    """Blend a plain Gaussian into patches.
+    """Blend a Gaussian of the plain response into patches.
 
-    Replace alpha by the gradient with respect to the exponent.
+    Alpha is replaced by the gradient with respect to the exponent.
 
     Returns:
-        The sums of the gradients with respect to red, green, blue and the depth.
+        The sums of the gradients with respect to red, green, blue and depth.
     """
     red = broadcast_wide(records, record + RED)
     green = broadcast_wide(records, record + GREEN)
@@ -212,9 +214,9 @@ def _moments(
 ) -> tuple[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes]:
     """Return SUM_1, SUM_D, SUM_Y, SUM_DD, SUM_YY, SUM_DY, SUM_ABS_X and SUM_ABS_Y in eight lanes.
 
-    The two halves of a patch's lanes belong to the same rows and have the same dy, so they are
-    added before the multiplication by dy. After this addition, six sums of eight lanes fit into
-    sixteen vector registers.
+    Both halves of a patch's lanes belong to the same pixel rows and have equal dy, so they are
+    added before the multiplication by dy. Afterwards, six sums of eight lanes fit into sixteen
+    vector registers.
     """
     # d(exponent)/d(mean y) = log 2 (2 row_decay dy - 2 slope decay dx)
     decay_row = broadcast(records, record + ROW_DECAY)
@@ -266,9 +268,9 @@ def _gather(
     partials: NDArray[np.float32],
     partial: int,
 ) -> None:
-    """Sum the gradients of one plain Gaussian over patches into partials[partial:].
+    """Sum the gradients of one Gaussian (plain response) over patches into `partials`.
 
-    `capped` is None if the alpha of the Gaussian reaches the cap in no pixel.
+    `capped` is None if the Gaussian's alpha reaches the cap in no pixel.
     """
     _respond(patches, records, record, rows, base, constants, capped, responses)
     sum_red, sum_green, sum_blue, sum_depth = _blend(
@@ -302,7 +304,7 @@ def _gather_analytic(
     partials: NDArray[np.float32],
     partial: int,
 ) -> None:
-    """Sum the gradients like `_gather`, for the analytic response."""
+    """Sum the gradients of one Gaussian over patches, for the analytic response."""
     red = broadcast_wide(records, record + RED)
     green = broadcast_wide(records, record + GREEN)
     blue = broadcast_wide(records, record + BLUE)
@@ -391,7 +393,7 @@ def _backward(
     partials: NDArray[np.float32],
     written: NDArray[np.uint8],
 ) -> None:
-    """Sum the gradients of one tile's entries."""
+    """Sum the gradients of all entries of a tile."""
     columns = (image.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH
     top = (tile // columns) * TILE_HEIGHT
     left = (tile % columns) * TILE_WIDTH
@@ -407,8 +409,8 @@ def _backward(
             prefetch(records, np.intp(entries[min(entry + 2 * BATCH, stop - 1), 0]) * RECORD)
             prefetch_write(partials, np.intp(entries[entry, 1]) * PARTIAL)
             batch[filled] = entry
-            # To avoid a branch, write every entry. The next entry overwrites an entry whose mask is
-            # empty.
+            # Write every entry, because a test would be a branch. If an entry has an empty mask,
+            # the next entry overwrites it.
             filled += np.intp(masks[entry] != 0)
             entry += 1
         for k in range(filled):
@@ -429,7 +431,7 @@ def _backward(
                     patches, records, record, rows, base, state, constants, v_depth, absolute,
                     partials, partial,
                 )  # fmt: skip
-            # There are two variants, because most Gaussians are never capped and need less work.
+            # There are two variants, because most Gaussians never reach the cap and need less work.
             elif records[record + LOG_OPACITY] <= constants[CAPPED]:
                 _gather(
                     patches, records, record, rows, base, state, constants, v_depth, absolute,
@@ -461,26 +463,26 @@ def differentiate(
     partials: NDArray[np.float32],
     written: NDArray[np.uint8],
 ) -> None:
-    """Sum the gradients of every entry with a mask over its tile's pixels.
+    """Sum the gradients of every entry with a mask over the pixels of its tile.
 
     Args:
-        jobs: From `share`.
-        starts: [T + 1] first entry of each tile.
-        entries: [E, 2] records and slots of each tile, front to back.
-        masks: [E] patches per entry, from the forward pass.
-        records: Records of the drawn Gaussians, flat.
-        constants: From `vector_constants`.
-        image: [H, W, 3] as rendered, with the background.
-        alpha: [H, W] as rendered.
-        depth: [H, W] as rendered, or None.
+        jobs: Work queue from `share`.
+        starts: [T + 1] index of the first entry of each tile.
+        entries: [E, 2] record and slot of each entry, from front to back within a tile.
+        masks: [E] patches of each entry as bits, from the forward pass.
+        records: The records of the drawn Gaussians, flat.
+        constants: Constants from `vector_constants`.
+        image: [H, W, 3] rendered image with background.
+        alpha: [H, W] rendered accumulated opacity.
+        depth: [H, W] rendered depth, or None.
         v_image: [H, W, 3] gradient of the loss with respect to the image.
         v_alpha: [H, W] gradient with respect to alpha, or None.
         v_depth: [H, W] gradient with respect to the depth, or None.
-        absolute: Any vector selects the sums of absolute gradients; None omits them.
-        analytic: Any vector selects records of the analytic response; None selects the plain
-            response.
-        partials: [slots * PARTIAL] written for slots of entries with a mask.
-        written: [slots] 1 written for slots of entries with a mask; zero before.
+        absolute: An array with any content selects the sums of absolute gradients; None omits them.
+        analytic: An array with any content selects records of the analytic response; None selects
+            the plain response.
+        partials: [slots * PARTIAL] output: sums for the slots of entries with a mask.
+        written: [slots] output: 1 for the slots of entries with a mask; must be zero at the start.
     """
     tiles = starts.shape[0] - 1
     tile = next_job(jobs, tiles)

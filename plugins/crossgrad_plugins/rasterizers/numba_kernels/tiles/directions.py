@@ -1,11 +1,10 @@
 """Gradients of single pixels with respect to a Gaussian's mean, and their directions.
 
-This is a separate pass after the backward pass, for densifiers that need directions. The pass
-renders the tiles again and sums, per entry and bin, the fields of
-`crossgrad_core.contract.gaussians.Screen.directions`.
+This pass follows the backward pass if a densifier needs directions. It renders the tiles again, and
+sums the fields of `crossgrad_core.contract.gaussians.Screen.directions` for each entry and bin.
 
-The operations are the same as in `backward`, in the same order, so the gradients have the same
-bits. Only the operations for sums of other gradients are left out.
+The operations and their order are those of `backward`, so the gradients have the same bits. Only
+operations for other sums are omitted.
 """
 
 import numpy as np
@@ -99,9 +98,9 @@ from crossgrad_plugins.rasterizers.numba_kernels.tiles.pixel_states import (
 )
 
 BINS, FIELDS = 6, 5
-#: Number of sums per entry: the sums of the bins, and two sums that are not used.
+#: Number of sums per entry: the sums of all bins, and two unused numbers.
 SUMS = 4 * LANES
-#: Records are prefetched this many entries ahead.
+#: Records are prefetched for entries this far ahead.
 _AHEAD = 8
 _SMALL, _UP = np.float32(2.0**-60), np.float32(2.0**90)
 _LARGE, _DOWN = np.float32(2.0**60), np.float32(2.0**-66)
@@ -109,14 +108,14 @@ _LARGE, _DOWN = np.float32(2.0**60), np.float32(2.0**-66)
 
 @device
 def _add(binned: NDArray[np.float32], number: int, inside: Mask, value: Lanes) -> None:
-    """Add the values inside a bin to sum `number`."""
+    """Add the values of the pixels inside a bin to sum `number`."""
     at = number * LANES
     store(binned, at, load(binned, at) + where(inside, value, splat(np.float32(0.0))))
 
 
 @device
 def _bin(position: float) -> int:
-    """Return the bin of a position along the axis."""
+    """Return the bin of a position along the longest axis."""
     return np.intp(min(max(np.floor(position), np.float32(-3.0)), np.float32(2.0))) + 3
 
 
@@ -133,26 +132,26 @@ def _spread(
     """Add the gradients of two columns of four pixels to the sums of their bins.
 
     Args:
-        gx: Gradients with respect to the x of the projected mean, px^-1.
-        gy: Gradients with respect to the y of the projected mean, px^-1.
-        along: Positions along the axis, in standard deviations.
-        width: Width of the image, pixels. Directions are in NDC units.
-        height: Height of the image, pixels.
+        gx: Gradients with respect to x of the projected mean, px^-1.
+        gy: Gradients with respect to y of the projected mean, px^-1.
+        along: Positions along the longest axis, in standard deviations.
+        width: Width of the image, pixels, for the conversion to NDC units.
+        height: Height of the image, pixels, for the conversion to NDC units.
         places: [LANES] buffer for `along`.
-        binned: [BINS * FIELDS * LANES].
+        binned: [BINS * FIELDS * LANES] sums of the bins.
     """
     one = splat(np.float32(1.0))
     hx, hy = gx * splat(width), gy * splat(height)
     largest = larger(magnitude(hx), magnitude(hy))
     moved = splat(np.float32(0.0)) < largest
-    # Scale by powers of two, so that the squares of any gradients stay within the range of float32.
+    # Scale by powers of two, so that squares of any gradients are valid float32 numbers.
     scale = where(largest < splat(_SMALL), splat(_UP), one)
     scale = where(splat(_LARGE) < largest, splat(_DOWN), scale)
     hx, hy = hx * scale, hy * scale
     inverse = one / square_root(fma(hx, hx, hy * hy))
     hx, hy, gx, gy = hx * inverse, hy * inverse, magnitude(gx), magnitude(gy)
-    # Positions along the axis increase or decrease along rows and columns of pixels. The corners of
-    # the patch therefore bound the bins.
+    # Positions along the axis are monotonic along rows and columns of pixels. The corners of a
+    # patch therefore give the smallest and the largest bin.
     store(places, 0, along)
     a, b = _bin(places[0]), _bin(places[SIDE - 1])
     c, d = _bin(places[LANES - SIDE]), _bin(places[LANES - 1])
@@ -175,7 +174,7 @@ def _weighted_color(
     state: NDArray[np.float32],
     v_depth: NDArray[np.float32] | None,
 ) -> Lanes:
-    """Return the gradients of a patch's pixels times the colour of the Gaussian."""
+    """Return the gradients of a patch's pixels, times the colour of the Gaussian."""
     at = patch * STATE
     weighted_color = load_wide(state, at + V_RED) * broadcast_wide(records, record + RED)
     weighted_color = fma(
@@ -202,11 +201,11 @@ def mean_gradients(
     v_depth: NDArray[np.float32] | None,
     analytic: NDArray[np.float32] | None,
 ) -> tuple[Lanes, Lanes]:
-    """Blend a Gaussian into a patch; return the gradients of the pixels.
+    """Blend a Gaussian into a patch, and return a gradient for each pixel.
 
-    Each gradient is with respect to x and y of the projected mean.
+    The gradient is with respect to x and y of the projected mean.
 
-    Gradients of plain records are in units of 2 log 2 px^-1; gradients of analytic records are in
+    For records of the plain response, the unit is 2 log 2 px^-1; for the analytic response, it is
     px^-1.
     """
     row = base + row_of(patch)
@@ -266,10 +265,10 @@ def _entry(
     slot_sums: NDArray[np.float32],
     at: int,
 ) -> None:
-    """Write the sums of one Gaussian over the reached patches of a tile to slot_sums[at:]."""
+    """Write the sums of one Gaussian over the reached patches of a tile to `slot_sums`."""
     half = splat(np.float32(0.5))
     axis_x, axis_y = broadcast(axes, axis), broadcast(axes, axis + 1)
-    # Here, pixel centres are at whole numbers, as in `fill_rows`.
+    # In this function, pixel centres have whole-number coordinates, as in `fill_rows`.
     u = (broadcast(records, record + U_WHOLE) - splat(np.float32(left))) + (
         broadcast(records, record + U_PART) - half
     )
@@ -291,7 +290,7 @@ def _entry(
         dy = y + splat(np.float32(row_of(patch))) - v
         along = fma(axis_x, dx, axis_y * dy)
         _spread(first_half(gx), first_half(gy), along, width, height, places, binned)
-        # The second half of the patch is to the right of the first half.
+        # The second half of a patch's lanes is to the right of the first half.
         along = fma(axis_x, dx + splat(np.float32(SIDE // 2)), axis_y * dy)
         _spread(last_half(gx), last_half(gy), along, width, height, places, binned)
     for group in range(SUMS // LANES):
@@ -327,24 +326,25 @@ def bin_directions(
     analytic: NDArray[np.float32] | None,
     found: NDArray[np.float32],
 ) -> None:
-    """Sum the directions of every entry with a mask over its tile's pixels.
+    """Sum the directions of every entry with a mask over the pixels of its tile.
 
     Args:
-        jobs: From `share`.
-        starts: [T + 1] first entry of each tile.
-        entries: [E, 2].
-        masks: [E].
-        records: Records of the drawn Gaussians, flat.
-        axes: [2 N] flat, per record, from `longest_axes`.
-        constants: From `vector_constants`.
-        image: [H, W, 3].
-        alpha: [H, W].
-        depth: [H, W] or None.
-        v_image: [H, W, 3].
-        v_alpha: [H, W] or None.
-        v_depth: [H, W] or None.
-        analytic: Any vector selects the analytic response; None selects the plain response.
-        found: [slots * SUMS] written for slots of entries with a mask.
+        jobs: Work queue from `share`.
+        starts: [T + 1] index of the first entry of each tile.
+        entries: [E, 2] record and slot of each entry.
+        masks: [E] patches of each entry as bits.
+        records: The records of the drawn Gaussians, flat.
+        axes: [2 N] projected longest axis per record, from `longest_axes`, flat.
+        constants: Constants from `vector_constants`.
+        image: [H, W, 3] rendered image.
+        alpha: [H, W] rendered accumulated opacity.
+        depth: [H, W] rendered depth, or None.
+        v_image: [H, W, 3] gradient with respect to the image.
+        v_alpha: [H, W] gradient with respect to alpha, or None.
+        v_depth: [H, W] gradient with respect to the depth, or None.
+        analytic: An array with any content selects the analytic response; None selects the plain
+            response.
+        found: [slots * SUMS] output: sums for the slots of entries with a mask.
     """
     columns = (image.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH
     state = aligned(DEPTHS + PATCHES * WIDE)

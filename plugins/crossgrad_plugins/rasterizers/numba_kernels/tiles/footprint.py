@@ -1,4 +1,4 @@
-"""The patches of a tile that a Gaussian reaches, and its 1-D Gaussian in each row."""
+"""The patches of a tile that a Gaussian reaches, and its 1-D Gaussian in each pixel row."""
 # ruff: noqa: ANN401 - Numba's and LLVM's objects have no types.
 
 from collections.abc import Callable
@@ -46,12 +46,12 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     WIDTH,
 )
 
-#: Row buffer of one Gaussian: the centre, the largest exponent and dy of each row.
+#: Row buffer of a Gaussian: for each pixel row, the centre, the largest exponent and dy.
 ROW_CENTRE = 0
 ROW_EXPONENT = TILE_HEIGHT
 ROW_DY = 2 * TILE_HEIGHT
 ROWS = 3 * TILE_HEIGHT
-# The bit shifts below assume patches of 4 x 4 pixels and sixteen columns of patches.
+# The bit shifts below require patches of 4 x 4 pixels and sixteen columns of patches.
 _LAST = float(TILE_WIDTH - 1)
 
 
@@ -68,7 +68,7 @@ def _reached_patches(at: Site, first: Any, last: Any) -> Any:
     )
     low = build.select(build.fcmp_ordered(">", first, zero), first, zero)
     high = build.select(build.fcmp_ordered("<", last, end), last, end)
-    # Set edges outside the tile to 0, because they may be NaN, which cannot be converted to an
+    # Set edges outside the tile to 0, because an edge may be NaN, which cannot be converted to an
     # integer.
     columns = [
         build.lshr(build.fptosi(build.select(inside, edge, zero), whole), number(whole, 2))
@@ -85,9 +85,9 @@ def _reached_patches(at: Site, first: Any, last: Any) -> Any:
     return build.bitcast(four, ir.IntType(64))
 
 
-#: Return the reached patches of the sixteen rows of a tile, given the first and last pixel of each
-#: row (no pixel if the comparison first <= last fails). Bit 16 r + c is the patch of columns 4 c to
-#: 4 c + 3 and rows 4 r to 4 r + 3. Only pixels 0 to 63 count.
+#: Return the reached patches of the sixteen pixel rows of a tile, from the first and last pixel of
+#: each row. A row has no pixel if first <= last is false. Bit 16 r + c is the patch of columns 4 c
+#: to 4 c + 3 and rows 4 r to 4 r + 3. Only pixels 0 to 63 of a row count.
 reached_patches: Callable[[Lanes, Lanes], np.uint64] = emitted(
     _reached_patches, types.uint64, SIXTEEN, SIXTEEN
 )
@@ -102,10 +102,10 @@ def fill_rows(
     rows: NDArray[np.float32],
     base: int,
 ) -> np.uint64:
-    """Write the row buffer at `base` and return the reached patches as bits.
+    """Write the row buffer at `base`, and return the reached patches as bits.
 
-    `left` and `top` are the tile's corner in pixels. Row centres are relative to the centre of a
-    pixel in the middle column.
+    `left` and `top` are the pixel coordinates of the tile's corner. Centres of rows are relative to
+    the centre of a pixel in the middle column.
     """
     half = splat_wide(np.float32(0.5))
     middle = splat_wide(np.float32(MIDDLE))
@@ -116,14 +116,14 @@ def fill_rows(
         broadcast_wide(records, record + V_PART) - half
     )
     row_decay = broadcast_wide(records, record + ROW_DECAY)
-    # Each lane belongs to one row of the tile.
+    # Each lane belongs to a pixel row of the tile.
     dy = ramp_wide() - v
     exponent = fnma(row_decay * dy, dy, broadcast_wide(records, record + LOG_OPACITY))
     centre = fma(broadcast_wide(records, record + SLOPE), dy, u)
     store(rows, base + ROW_CENTRE, centre)
     store(rows, base + ROW_EXPONENT, exponent)
     store(rows, base + ROW_DY, dy)
-    # Rows that the Gaussian does not reach are NaN, and NaN fails every comparison.
+    # Values of rows that the Gaussian does not reach are NaN, for which every comparison is false.
     budget = (exponent + splat_wide(np.float32(SPARE - TOUCH))) * broadcast_wide(
         records, record + WIDTH
     )

@@ -1,4 +1,4 @@
-"""Compositing of the tiles, front to back."""
+"""Compositing of the pixels of tiles, from front to back."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,20 +77,20 @@ from crossgrad_plugins.rasterizers.numba_kernels.tiles.pixel_states import (
     row_of,
 )
 
-#: Number of entries whose reach is computed before any of them is blended. Processing the entries
-#: in batches hides the latency of memory reads and of the row extents. Finished patches are
-#: detected once per batch.
+#: Number of entries whose reached patches are computed before the first entry is blended. A batch
+#: of entries hides the waiting times of memory reads. Once per batch, patches whose pixels are all
+#: finished are removed.
 BATCH = 16
 
-# Side in pixels of the squares that `limits` counts, and a bit mask of the patches in the first
-# column of squares.
+# Side length, in pixels, of the squares that `limits` counts, and the patches in the first column
+# of squares as bits.
 _SQUARE = int(SQUARE)
 _ABREAST = np.uint64(
     sum(1 << patch for patch in range(PATCHES) if patch % COLUMNS < _SQUARE // SIDE)
 )
 
-# State of a patch, WIDE numbers each: transmittance (negative once a pixel is finished) and three
-# channels. The depths of all patches follow the states of all patches.
+# State of a patch, WIDE numbers each: transmittance (negative after a pixel is finished) and three
+# colour channels. The depths of all patches follow after the states of all patches.
 _T, _RED, _GREEN, _BLUE = 0, WIDE, 2 * WIDE, 3 * WIDE
 _STATE = 4 * WIDE
 _DEPTHS = PATCHES * _STATE
@@ -100,7 +100,7 @@ _DEPTHS = PATCHES * _STATE
 def _start(
     state: NDArray[np.float32], width: int, height: int, constants: NDArray[np.float32]
 ) -> np.uint64:
-    """Clear the state of a tile of width x height pixels; return the tile's patches as bits."""
+    """Clear the state of a tile of width x height pixels; return its patches as bits."""
     state[:] = np.float32(0.0)
     live = np.uint64(0)
     x = load_wide(constants, OFFSETS) + splat_wide(np.float32(MIDDLE))
@@ -116,7 +116,7 @@ def _start(
 
 @device
 def _within(limits: NDArray[np.int32], record: int, left: int) -> np.uint64:
-    """Return the patches of a tile (first column `left`) within a record's limits."""
+    """Return the patches of a tile, whose first column is `left`, within a record's limits."""
     inside = np.uint64(0)
     for column in range(0, COLUMNS, _SQUARE // SIDE):
         square = (left + column * SIDE) // _SQUARE
@@ -127,7 +127,7 @@ def _within(limits: NDArray[np.int32], record: int, left: int) -> np.uint64:
 
 @device
 def _unfinished(state: NDArray[np.float32], live: np.uint64) -> np.uint64:
-    """Return the live patches that still have an unfinished pixel."""
+    """Return the active patches that still contain an unfinished pixel."""
     rest = live
     going = np.uint64(0)
     while rest != np.uint64(0):
@@ -152,7 +152,8 @@ def _coverage(
 ) -> tuple[Lanes, np.uint64]:
     """Compute the analytic response in a patch.
 
-    Returns: Alpha, and the bits `left`, without the bit of the patch if the patch is out of reach.
+    Returns: Alpha, and the bits `left`; the bit of the patch is cleared if the Gaussian does not
+    reach it.
     """
     cosine, sine = broadcast_wide(records, record + COSINE), broadcast_wide(records, record + SINE)
     inverse_1 = broadcast_wide(records, record + INVERSE_1)
@@ -179,11 +180,11 @@ def _blend(
     counts: NDArray[np.int32] | None,
     analytic: NDArray[np.float32] | None,
 ) -> tuple[int, np.uint64]:
-    """Blend one Gaussian into the reached patches.
+    """Blend one Gaussian into the patches that it reaches.
 
     Returns:
-        The number of pixels blended, and the reached patches except patches found to be out of
-            reach.
+        The number of blended pixels, and the patches
+        that the Gaussian reaches.
     """
     left = rest = reached
     decay = broadcast_wide(records, record + DECAY)
@@ -209,8 +210,8 @@ def _blend(
         else:
             alpha, left = _coverage(left, patch, offsets, rows, row, records, record, constants)
             touched = alpha >= least
-        # If a pixel is not touched, alpha is undefined and possibly NaN. Select values by a mask
-        # and never multiply them by 0.
+        # If a pixel is not touched, alpha is undefined and may be NaN. Select values by a mask,
+        # because a multiplication by 0 would keep the NaN.
         alpha = where(touched, smaller(alpha, most), zero)
         before = load_wide(state, at + _T)
         weight = alpha * before
@@ -240,7 +241,7 @@ def _finish_row(
     image: NDArray[np.float32],
     alpha: NDArray[np.float32],
 ) -> None:
-    """Add the background to eight pixels, and write the pixels from a flat index on."""
+    """Add the background to eight pixels, and write them from a flat index on."""
     through = magnitude(passed)
     store_triples(
         image,
@@ -262,7 +263,7 @@ def _finish_two(
     alpha: NDArray[np.float32],
     depth: NDArray[np.float32] | None,
 ) -> None:
-    """Write a patch and its right neighbour, whose pixels begin at a flat index."""
+    """Write a patch and its right neighbour; their pixels begin at a flat index."""
     at, width = patch * _STATE, image.shape[1]
     t = _rows_at(state, at + _T, _STATE)
     r = _rows_at(state, at + _RED, _STATE)
@@ -282,7 +283,7 @@ def _finish_two(
 
 @device
 def _rows_at(state: NDArray[np.float32], at: int, ahead: int) -> tuple[Lanes, Lanes, Lanes, Lanes]:
-    """Return the rows of a patch and of the next patch, `ahead` floats later."""
+    """Return the pixel rows of a patch and of the patch that is `ahead` floats later."""
     return four_rows(load_wide(state, at), load_wide(state, at + ahead))
 
 
@@ -296,7 +297,7 @@ def _finish(
     alpha: NDArray[np.float32],
     depth: NDArray[np.float32] | None,
 ) -> None:
-    """Add the background and write the tile's pixels."""
+    """Add the background, and write the pixels of a tile."""
     width = image.shape[1]
     high, wide = min(TILE_HEIGHT, image.shape[0] - top), min(TILE_WIDTH, width - left)
     # Write pairs of complete patches first, then the remaining pixels one by one.
@@ -335,7 +336,7 @@ def _composite(
     limits: NDArray[np.int32] | None,
     masks: NDArray[np.uint64],
 ) -> None:
-    """Composite one tile, and write to `masks` the patches into which each entry was blended."""
+    """Composite one tile, and write to `masks` the patches in which each entry was blended."""
     columns = (image.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH
     top = (tile // columns) * TILE_HEIGHT
     left = (tile % columns) * TILE_WIDTH
@@ -363,8 +364,8 @@ def _composite(
                 reached &= _within(limits, np.intp(entries[k, 0]), left)
             masks[k] = np.uint64(reached)
             batch[filled] = k
-            # To avoid a branch, write every entry. The next entry overwrites an entry that reaches
-            # no patch.
+            # Write every entry, because a test would be a branch. If an entry reaches no patch, the
+            # next entry overwrites it.
             filled += np.intp(reached != np.uint64(0))
         for k in range(filled):
             record = np.intp(entries[batch[k], 0]) * RECORD
@@ -398,21 +399,21 @@ def composite(
     """Composite all tiles.
 
     Args:
-        jobs: From `share`.
-        starts: [T + 1] first entry of each tile.
-        entries: [E, 2] records and slots of each tile, front to back.
-        records: Records of the drawn Gaussians, flat.
-        constants: From `vector_constants`.
-        background: [3] RGB.
-        image: [H, W, 3] written.
-        alpha: [H, W] written.
-        depth: [H, W] written, or None.
-        counts: [slots] pixels blended per slot, written; zero before. None means that pixels are
-            not counted.
-        analytic: Any vector selects records of the analytic response; None selects the plain
-            response.
-        limits: [N, 2] first and last column of 16 pixels per record; None means no limits.
-        masks: [E] patches per entry, written; zero before.
+        jobs: Work queue from `share`.
+        starts: [T + 1] index of the first entry of each tile.
+        entries: [E, 2] record and slot of each entry, from front to back within a tile.
+        records: The records of the drawn Gaussians, flat.
+        constants: Constants from `vector_constants`.
+        background: [3] RGB of the background.
+        image: [H, W, 3] output: the image.
+        alpha: [H, W] output: accumulated opacity.
+        depth: [H, W] output: depth; None if not needed.
+        counts: [slots] output: number of blended pixels per slot; must be zero at the start. If
+            None, pixels are not counted.
+        analytic: An array with any content selects records of the analytic response; None selects
+            the plain response.
+        limits: [N, 2] first and last column of 16 pixels per record; None for no limits.
+        masks: [E] output: patches of each entry as bits; must be zero at the start.
     """
     tiles = starts.shape[0] - 1
     tile = next_job(jobs, tiles)

@@ -1,8 +1,8 @@
 """The number of marked pixels in which each Gaussian of a rendered view was blended.
 
-This is a separate pass after a render, for callers that can mark pixels only after they have the
-render. The pass uses the tile lists of the forward pass and repeats the blending, without colours,
-in the patches with a marked pixel. The operations and decisions are the same as in `forward`.
+This pass follows a render, for callers that can mark pixels only after they have seen the render.
+It uses the tile lists of the forward pass, and repeats the blending without colours, in the patches
+that contain a marked pixel. Its operations and decisions are those of `forward`.
 """
 
 import numpy as np
@@ -62,16 +62,16 @@ from crossgrad_plugins.rasterizers.numba_kernels.tiles.pixel_states import (
     row_of,
 )
 
-#: Records are prefetched this many entries ahead.
+#: Records are prefetched for entries this far ahead.
 _AHEAD = 8
 
 
 @device
 def _start(state: NDArray[np.float32], marked: NDArray[np.uint8], top: int, left: int) -> np.uint64:
-    """Write the transmittances of a tile: 1 in marked pixels, -1 in all others.
+    """Write the transmittances of a tile: 1 in marked pixels, -1 in all other pixels.
 
     Returns:
-        The patches that contain a marked pixel, as bits.
+        The patches with a marked pixel, as bits.
     """
     state[:] = np.float32(-1.0)
     live = np.uint64(0)
@@ -94,7 +94,7 @@ def _count(
     constants: NDArray[np.float32],
     analytic: NDArray[np.float32] | None,
 ) -> int:
-    """Blend one Gaussian into the reached patches; return the number of pixels."""
+    """Blend one Gaussian into the patches that it reaches; return the number of blended pixels."""
     decay = broadcast_wide(records, record + DECAY)
     cosine, sine = broadcast_wide(records, record + COSINE), broadcast_wide(records, record + SINE)
     inverse_1 = broadcast_wide(records, record + INVERSE_1)
@@ -121,8 +121,8 @@ def _count(
         alpha = where(touched, smaller(alpha, load_wide(constants, LARGEST_ALPHA)), zero)
         before = load_wide(state, patch * WIDE)
         after = before - alpha * before
-        # Transmittance never increases. A pixel that has stopped or is not marked is therefore
-        # never blended again.
+        # Transmittance never increases. A pixel that is finished or not marked is therefore not
+        # blended again.
         store(state, patch * WIDE, after)
         pixels += count_bits(bits(touched & (after >= load_wide(constants, STOPPED))))
     return pixels
@@ -140,18 +140,19 @@ def count_marked(
     analytic: NDArray[np.float32] | None,
     counts: NDArray[np.int32],
 ) -> None:
-    """Count, for each entry, the marked pixels of its tile in which the entry was blended.
+    """Count for each entry the marked pixels of its tile in which the entry was blended.
 
     Args:
-        jobs: From `share`.
-        starts: [T + 1] first entry of each tile.
-        entries: [E, 2] records and slots of each tile, front to back.
-        masks: [E] patches per entry, from the forward pass.
-        records: Records of the drawn Gaussians, flat.
-        constants: From `vector_constants`.
-        marked: [H, W], non-zero if a pixel counts.
-        analytic: Any vector selects the analytic response; None selects the plain response.
-        counts: [slots] written; zero before.
+        jobs: Work queue from `share`.
+        starts: [T + 1] index of the first entry of each tile.
+        entries: [E, 2] record and slot of each entry, from front to back within a tile.
+        masks: [E] patches of each entry as bits, from the forward pass.
+        records: The records of the drawn Gaussians, flat.
+        constants: Constants from `vector_constants`.
+        marked: [H, W] non-zero for pixels that count.
+        analytic: An array with any content selects the analytic response; None selects the plain
+            response.
+        counts: [slots] output; must be zero at the start.
     """
     columns = (marked.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH
     state = aligned(PATCHES * WIDE)

@@ -38,7 +38,7 @@ _PLACES = [(x, y) for x in range(SIDE) for y in range(SIDE)]
 _left_patch, _right_patch = (
     picking([y * LANES + start + x for x, y in _PLACES]) for start in (0, SIDE)
 )
-# Arrange the left patch and the right patch as the first two rows and the last two rows of pixels.
+# Arrange the left and the right patch as the first two and the last two rows of pixels.
 _first_rows, _last_rows = (
     picking([x // SIDE * WIDE + x % SIDE * SIDE + y for y in rows for x in range(LANES)])
     for rows in ((0, 1), (2, 3))
@@ -47,19 +47,19 @@ _first_rows, _last_rows = (
 
 @device
 def row_of(patch: int) -> int:
-    """Return the first row of pixels of a patch."""
+    """Return the first pixel row of a patch."""
     return (patch // COLUMNS) * SIDE
 
 
 @device
 def column_of(patch: int) -> int:
-    """Return the column of patches that contains a patch."""
+    """Return the column of patches in which a patch is."""
     return patch & (COLUMNS - 1)
 
 
 @device
 def place_of(x: int, y: int) -> tuple[int, int]:
-    """Return the patch that contains pixel (x, y) of a tile, and the pixel's lane."""
+    """Return the patch that contains pixel (x, y) of a tile, and the lane of the pixel."""
     return (y // SIDE) * COLUMNS + x // SIDE, (x % SIDE) * SIDE + y % SIDE
 
 
@@ -77,13 +77,13 @@ def four_rows(left: Lanes, right: Lanes) -> tuple[Lanes, Lanes, Lanes, Lanes]:
     return first_half(above), last_half(above), first_half(below), last_half(below)
 
 
-#: State of a patch, WIDE numbers each: transmittance (negative once the pixel is finished), the
-#: remaining part S of the loss' linear form (see `backward`), and gradients of the three channels.
+#: State of a patch, WIDE numbers each: transmittance (negative after a pixel is finished), the
+#: remaining part S of the linearised loss (see `backward`), and the gradients of three channels.
 PASSED, REST, V_RED, V_GREEN, V_BLUE = 0, WIDE, 2 * WIDE, 3 * WIDE, 4 * WIDE
 STATE = 5 * WIDE
-#: The gradients of the depths of all patches follow the states of all patches.
+#: The gradients of the depths of all patches follow after the states of all patches.
 DEPTHS = PATCHES * STATE
-#: Values of eight pixels: S, the gradients of the three channels, and the gradient of the depth.
+#: Values of eight pixels: S, the gradients of three channels, and the gradient of the depth.
 _Eight = tuple[Lanes, Lanes, Lanes, Lanes, Lanes]
 
 
@@ -97,7 +97,7 @@ def _eight(
     v_alpha: NDArray[np.float32] | None,
     v_depth: NDArray[np.float32] | None,
 ) -> _Eight:
-    """Return the initial state of eight pixels, from a flat index on."""
+    """Return the initial values of eight pixels, from a flat index on."""
     r, g, b = load_triples(image, 3 * pixel)
     red, green, blue = load_triples(v_image, 3 * pixel)
     rest = red * r + green * g + blue * b
@@ -114,7 +114,7 @@ def _eight(
 def _store_two(
     state: NDArray[np.float32], at: int, ahead: int, a: Lanes, b: Lanes, c: Lanes, d: Lanes
 ) -> None:
-    """Write four rows of eight pixels to a patch and to the next patch, `ahead` floats later."""
+    """Write four rows of eight pixels to a patch and to the patch that is `ahead` floats later."""
     left, right = two_patches(a, b, c, d)
     store(state, at, left)
     store(state, at + ahead, right)
@@ -162,7 +162,7 @@ def _start_pixel(
     v_alpha: NDArray[np.float32] | None,
     v_depth: NDArray[np.float32] | None,
 ) -> None:
-    """Write the state of a lane of a patch for pixel (i, j) of the image."""
+    """Write the state of one lane of a patch, for pixel (i, j) of the image."""
     at = patch * STATE + lane
     red, green, blue = v_image[i, j, 0], v_image[i, j, 1], v_image[i, j, 2]
     rest = red * image[i, j, 0] + green * image[i, j, 1] + blue * image[i, j, 2]
@@ -232,17 +232,18 @@ def blend(
     """Blend a Gaussian into the pixels of a patch.
 
     Args:
-        alpha: The Gaussian's alpha in the pixels, at most the cap; 0 where it is not drawn.
-        odds: alpha / (1 - alpha); negative for pixels where alpha is capped and has no gradient.
+        alpha: The alpha of the Gaussian in each pixel, at most the cap; 0 if it is not drawn there.
+        odds: alpha / (1 - alpha) of each pixel; negative if alpha is capped and therefore has no
+            gradient.
         capped: None if no odds are negative.
-        weighted_color: The gradients of the pixels times the colour of the Gaussian.
-        state: State of the tile.
-        at: First element of the patch's state.
-        constants: From `vector_constants`.
+        weighted_color: The gradients of the pixels, times the colour of the Gaussian.
+        state: State of the tile, which is updated.
+        at: Index of the first element of the patch's state.
+        constants: Constants from `vector_constants`.
 
-    Returns: The weights of the Gaussian in the pixels, and alpha times the gradient of the loss
-    with respect to alpha. The second result is also the gradient with respect to the exponent and
-    with respect to the logarithm of the opacity.
+    Returns: The blending weight of the Gaussian in each pixel, and alpha times the gradient with
+    respect to alpha. The second result equals the gradients with respect to the exponent and to the
+    logarithm of the opacity.
     """
     zero = splat_wide(np.float32(0.0))
     before = load_wide(state, at + PASSED)
