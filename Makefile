@@ -17,7 +17,7 @@ BASE ?= HEAD~1
 # What `make paper` hands on, such as PAPER="--scenes DIR --workers 1".
 PAPER ?=
 
-.PHONY: demo install test bits slow matrix exposures compat faults fuzz lint bench paper clean
+.PHONY: demo install test bits slow browser matrix exposures compat faults fuzz lint bench paper clean
 
 demo: install  ## Train the bundled real scene for two minutes at most and print the results
 	$(BIN)/crossgrad run
@@ -40,6 +40,10 @@ matrix:  ## Train every combination of components for a few steps (CONTRIBUTING.
 
 slow:  ## The tests that take minutes: statistics of many repetitions, gradients entry by entry, Ray
 	PYTHON="$(PYTHON)" TEST_VENV="$(abspath $(TEST_VENV))" EXTRAS=test,lint,ray sh tests/run.sh -m slow
+
+browser:  ## The HTML page in Chromium, which must be installed (Debian package: chromium)
+	PYTHON="$(PYTHON)" TEST_VENV="$(abspath $(TEST_VENV))" CROSSGRAD_BROWSER=required \
+	    sh tests/run.sh -m browser
 
 exposures:  ## Train every exposure x backbone x K for sixty steps, and photos of all extremes
 	PYTHON="$(PYTHON)" TEST_VENV="$(abspath $(TEST_VENV))" sh tests/run.sh -m exposures

@@ -4,11 +4,11 @@
         --folders ladder mid --bands 4 --baseline ARM
 
 The finished runs of one scene are evaluated on the views of another capture of the same place. The
-runs were not trained on these views. Runs are evaluated as by `crossgrad eval RUN --on SCENE [--file
-FILE]`. Finished evaluations are not repeated. A file beside each table records the scene, the step
-and the PLY. The views of each folder are sorted into bands by the size of a pixel on the visible
-surface, so that the table goes from near to far. Brackets in the table contain the number of
-measured views. Only runs whose checkpoints exist can be evaluated.
+runs were not trained on these views. Runs are evaluated as by `crossgrad eval RUN --on SCENE
+[--file FILE]`. Finished evaluations are not repeated. A file beside each table records the scene,
+the step and the PLY. The views of each folder are sorted into bands by the size of a pixel on the
+visible surface, so that the table goes from near to far. Brackets in the table contain the number
+of measured views. Only runs whose checkpoints exist can be evaluated.
 """
 
 import argparse

@@ -11,7 +11,8 @@ of both codes are drawn on the held-out views of the last code. The first code m
 views, too. Photos have a longer side of 400 px, or of `--max-size` (0: the default size). A run
 uses one thread for each named core (Linux). The two runs of a pair follow each other on these
 cores. Finished runs are not repeated. PSNR is measured on the exported PLY on black, drawn by
-`crossgrad eval --file` and, if `--max-size` is not 0, also by `viewer.py`. `table OUT --figure NAME`
+`crossgrad eval --file` and, if `--max-size` is not 0, also by `viewer.py`.
+`table OUT --figure NAME`
 compares another metric of the held-out views in summary.json, such as `ssim`.
 
     python benchmarks/time_to_quality.py run OUT --scene SCENE [--scene SCENE ...] --core 0 1 \

@@ -17,6 +17,8 @@ PLAIN_INITIALIZER: Final = "points"
 INITIALIZER_WITHOUT_POINTS: Final = "triangulated"
 RESOLUTION: Final = "full"
 EXPORTER: Final = "ply"
+#: Exporter of the page that shows a small scene in a browser.
+PAGE_EXPORTER: Final = "html"
 METRICS: Final = "psnr+ssim+ssim-skimage+psnr-track+psnr-cc+lpips"
 #: Densifier of backbones that define no default densifier.
 DENSIFIER: Final = "adc"

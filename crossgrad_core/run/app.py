@@ -26,7 +26,7 @@ from crossgrad_core.run.finish import (
     Forecast,
     RunLoop,
     exit_messages,
-    next_line,
+    next_lines,
     reason_of,
     resume_line,
 )
@@ -215,7 +215,7 @@ def run(  # noqa: PLR0913 - one parameter per option of the command line
 def _end(outcome: "Outcome", way: "Way") -> int:
     """Print commands that the user may run next after a finished run; return the exit code."""
     if outcome.ending.status == "finished" and way.verbosity >= 0 and outcome.folder.is_dir():
-        print(next_line(outcome.folder))  # noqa: T201
+        print("\n".join(next_lines(outcome.folder)))  # noqa: T201
     return outcome.exit_code
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from json import dumps
 from math import fsum
 from pathlib import Path
+from typing import Final
 
 import torch
 from torch import Tensor
@@ -14,8 +15,10 @@ from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.georeference import COORDINATES_TAG, INPUT, LOCAL, Placed
 from crossgrad_core.contract.scene import Camera, View
 from crossgrad_core.contract.slots.exporter import ExportContent, Exporter
+from crossgrad_core.defaults import PAGE_EXPORTER
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import compare, psnr
+from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.run.export_edits import Crop, camera_in, most_important, upright, with_degree
 from crossgrad_core.system.files import write_atomically
 from crossgrad_core.training.per_image_params import apply
@@ -23,6 +26,9 @@ from crossgrad_core.training.rules import eval_parameters
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.views import eval_background
+
+#: A run writes no page that could be larger than this. The size is that of an attachment to a mail.
+MOST_PAGE_BYTES: Final = 25_000_000
 
 
 @dataclass(frozen=True)
@@ -95,6 +101,25 @@ class ExportOptions:
         return any(v is not None for v in (self.sh_degree, self.crop, self.max_gaussians))
 
 
+@dataclass(frozen=True, eq=False)
+class _Prepared:
+    """A scene that is ready to be written to a file.
+
+    Attributes:
+        gaussians: The Gaussians in the local frame.
+        baked: True if the backbone's Gaussians depend on the view or have another response.
+        views: The views that the Gaussians are baked for.
+        placed: The Gaussians in the coordinates of the file.
+        content: The content of the file.
+    """
+
+    gaussians: Gaussians
+    baked: bool
+    views: tuple[View, ...]
+    placed: Placed
+    content: ExportContent
+
+
 def export_scene(
     setup: Setup,
     state: TrainState,
@@ -116,23 +141,77 @@ def export_scene(
             these coordinates, or the file cannot be written.
     """
     exporter, scene = exporter or setup.selection.exporter, setup.scene
-    view = None if options.camera is None else view_named(setup, options.camera)
-    views = setup.train_views if view is None else (view,)
+    ready = _prepared(setup, state, path, exporter, options)
+    number = len(ready.gaussians)
+    notes = exporter.write(ready.content, path)
+    notes += (*ready.placed.notes, *_write_georef(path, ready.placed, exporter))
+    background = _own_background(setup)
+    exact = setup.backbone.plain or not ready.baked
+    if exact and background is None and not exporter.lossy and not options.reduces:
+        return Exported(number, notes=notes)
+    compared = scene.test_views if options.camera is None else ready.views
+    drawn = drawer(setup, state, exporter.stored(ready.gaussians, scene.similarity))
+    return Exported(
+        gaussians=number,
+        baked_for=(options.camera or f"{len(ready.views)} training views") if ready.baked else None,
+        views=len(compared),
+        psnr=_mean_psnr(compared, drawn),
+        live_psnr=_mean_psnr(compared, renderer(setup, state)),
+        background=background,
+        notes=notes,
+    )
+
+
+def write_page(setup: Setup, state: TrainState, path: Path, gaussians: int) -> Exported | None:
+    """Write a page that shows the scene in a browser, if it is small.
+
+    Args:
+        setup: The run.
+        state: The state of the run.
+        path: The file; an old one is removed if no page is written.
+        gaussians: Number of Gaussians of the run's exported file.
+
+    Returns:
+        A description of the page. None if the exporter of pages is not installed, or if the page
+        could be larger than `MOST_PAGE_BYTES`.
+
+    Raises:
+        UserError: The page cannot be written.
+    """
+    path.unlink(missing_ok=True)
+    if PAGE_EXPORTER not in entries("exporters"):
+        return None
+    exporter = build(Exporter, PAGE_EXPORTER, {})
+    size = exporter.largest_size(gaussians)
+    if size is None or size > MOST_PAGE_BYTES:
+        return None
+    return export_scene(setup, state, path, exporter)
+
+
+def _prepared(
+    setup: Setup, state: TrainState, path: Path, exporter: Exporter, options: ExportOptions
+) -> _Prepared:
+    """Return the scene as the exporter writes it to `path`; see `export_scene`."""
+    scene = setup.scene
+    views = setup.train_views if options.camera is None else (view_named(setup, options.camera),)
     coordinates, axis = coordinates_of(setup, exporter, options)
-    baked = with_degree(_gaussians_of(setup, state, exporter, views, options), options.sh_degree)
-    placed = scene.georeference.placed(baked, scene.similarity, coordinates)
+    all_gaussians, baked = _gaussians_of(setup, state, exporter, views, options)
+    gaussians = with_degree(all_gaussians, options.sh_degree)
+    placed = scene.georeference.placed(gaussians, scene.similarity, coordinates)
     placed = upright(placed, scene.up, axis, coordinates)
-    rows = torch.ones(len(baked), dtype=torch.bool)
+    rows = torch.ones(len(gaussians), dtype=torch.bool)
     if options.crop is not None:
         means = placed.gaussians.means.detach().cpu().double().numpy()
         rows = torch.from_numpy(options.crop.inside(placed.similarity.to_input(means), axis))
     if options.max_gaussians is not None and int(rows.sum()) > options.max_gaussians:
-        kept = most_important(setup, baked.selected(rows), setup.train_views, options.max_gaussians)
+        kept = most_important(
+            setup, gaussians.selected(rows), setup.train_views, options.max_gaussians
+        )
         rows[rows.clone()] = kept
     if options.reduces:
-        baked = baked.selected(rows)
+        gaussians = gaussians.selected(rows)
         placed = replace(placed, gaussians=placed.gaussians.selected(rows))
-    if not len(baked):
+    if not len(gaussians):
         raise UserError(
             "no Gaussian is left to export",
             where=path,
@@ -156,24 +235,9 @@ def export_scene(
         placed.rotation @ scene.up,
         placed.to_ecef,
         tuple(comments),
+        scene.name,
     )
-    notes = exporter.write(content, path)
-    notes += (*placed.notes, *_write_georef(path, placed, exporter))
-    bakes = options.baked and not setup.backbone.plain
-    plain, background = setup.backbone.plain, _own_background(setup)
-    if plain and background is None and not exporter.lossy and not options.reduces:
-        return Exported(len(baked), notes=notes)
-    compared = scene.test_views if view is None else (view,)
-    drawn = drawer(setup, state, exporter.stored(baked, scene.similarity))
-    return Exported(
-        gaussians=len(baked),
-        baked_for=options.camera or f"{len(views)} training views" if bakes else None,
-        views=len(compared),
-        psnr=_mean_psnr(compared, drawn),
-        live_psnr=_mean_psnr(compared, renderer(setup, state)),
-        background=background,
-        notes=notes,
-    )
+    return _Prepared(gaussians, baked, views, placed, content)
 
 
 def _gaussians_of(
@@ -182,29 +246,31 @@ def _gaussians_of(
     exporter: Exporter,
     views: Sequence[View],
     options: ExportOptions,
-) -> Gaussians:
-    """Return the model's Gaussians in the local frame, baked for the views if that is asked for."""
+) -> tuple[Gaussians, bool]:
+    """Return the Gaussians in the local frame, and True if they are baked for the views."""
     phase, parameters = setup.phase(state.step, training=False), eval_parameters(setup, state)
+    keeps = exporter.keeps_response or not options.baked
     with torch.no_grad():
+        unbaked = setup.backbone.unbaked(parameters, phase) if keeps else None
+        if unbaked is not None and unbaked.response in exporter.responses:
+            return unbaked, False
         if options.baked:
-            return setup.backbone.bake(parameters, phase, [view.camera for view in views])
-        unbaked = setup.backbone.unbaked(parameters, phase)
-    if unbaked is not None and unbaked.response not in exporter.responses:
+            cameras = [view.camera for view in views]
+            return setup.backbone.bake(parameters, phase, cameras), not setup.backbone.plain
+    if unbaked is not None:
         raise UserError(
             f"the format cannot store Gaussians with the response {unbaked.response}",
             where="--unbaked",
             expected="a format with a field for the response, such as ply or spz",
             todo="leave --unbaked out, or choose another --format",
         )
-    if unbaked is None:
-        raise UserError(
-            f"--unbaked has no effect: backbone {setup.selection.names['backbone']} has no "
-            "response of its own that a file can store",
-            where="--unbaked",
-            expected="a backbone with its own response, such as mip",
-            todo="leave --unbaked out",
-        )
-    return unbaked
+    raise UserError(
+        f"--unbaked has no effect: backbone {setup.selection.names['backbone']} has no "
+        "response of its own that a file can store",
+        where="--unbaked",
+        expected="a backbone with its own response, such as mip",
+        todo="leave --unbaked out",
+    )
 
 
 def coordinates_of(setup: Setup, exporter: Exporter, options: ExportOptions) -> tuple[str, str]:

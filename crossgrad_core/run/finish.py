@@ -18,7 +18,7 @@ from crossgrad_core.run.results.log import RunLog, roughly
 from crossgrad_core.run.results.metrics_csv import Row, read_metrics
 from crossgrad_core.run.results.seal import seal
 from crossgrad_core.run.results.summary import Status, best_of
-from crossgrad_core.run.session import PANELS, Session
+from crossgrad_core.run.session import PAGE, PANELS, Session
 from crossgrad_core.scene.photos.photos_ahead import fits
 from crossgrad_core.system.checksums import SUMS
 from crossgrad_core.training.budget import Length, seconds_ahead
@@ -190,6 +190,7 @@ class RunLoop:
             ("no per_view.csv", lambda: session.write_views(state)),
             ("no curve.png", lambda: session.draw(setup, state)),
             ("no point_cloud.ply", lambda: session.export(setup, state)),
+            (f"no {PAGE}", lambda: session.write_page(setup, state)),
         )
         for missing, write in parts:
             self._attempt(missing, partial(self._unless_interrupted, write))
@@ -289,10 +290,13 @@ def overdone(rows: Sequence[Row]) -> list[str]:
     ]
 
 
-def next_line(folder: Path) -> str:
-    """Return the commands that render and export the results of a finished run."""
+def next_lines(folder: Path) -> list[str]:
+    """Return the commands that render and export the results of a finished run, and its page."""
     run = one_line(quote(str(folder)))
-    return f"next: crossgrad render {run} (images), crossgrad export {run} (a file for viewers)"
+    lines = [f"next: crossgrad render {run} (images), crossgrad export {run} (a file for viewers)"]
+    if (folder / PAGE).is_file():
+        lines.append(f"open the scene in a browser: {one_line(folder / PAGE)}")
+    return lines
 
 
 def resume_line(folder: Path) -> str:

@@ -7,11 +7,12 @@ from pathlib import Path
 from time import perf_counter
 
 from crossgrad_core.contract.contexts import EvaluationReport
+from crossgrad_core.defaults import PAGE_EXPORTER
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import evaluate
 from crossgrad_core.evaluation.result import EvaluationResult
 from crossgrad_core.run.checkpoint import Keep, drop_later, latest, renew_scalars, save
-from crossgrad_core.run.export import Exported, described, export_scene, renderer
+from crossgrad_core.run.export import Exported, described, export_scene, renderer, write_page
 from crossgrad_core.run.load_run import to_checkpoint
 from crossgrad_core.run.results.curve import draw_curve
 from crossgrad_core.run.results.kept import KEY as KEPT
@@ -34,6 +35,8 @@ from crossgrad_core.training.state import TrainState
 
 #: Name of the file with the trained scene, for viewers. The exporter adds the suffix.
 CLOUD = "point_cloud"
+#: Name of the page that shows a small scene in a browser.
+PAGE = f"{CLOUD}.{PAGE_EXPORTER}"
 #: Number of held-out views for which panels are rendered.
 PANELS = 4
 
@@ -177,10 +180,20 @@ class Session:
         """Write the trained scene and log a description of the file."""
         path = self.folder / f"{CLOUD}.{setup.selection.exporter.suffix}"
         with reporting(state):
-            self._exports[path.name] = export_scene(setup, state, path)
+            self._exports = {path.name: export_scene(setup, state, path)}
             write_photos(setup, state, self.folder / PHOTO_VALUES)
         for line in described(self._exports[path.name], path):
             setup.hook.crossgrad_log(text=line)
+
+    def write_page(self, setup: Setup, state: TrainState) -> None:
+        """Write a page that shows the exported scene, if it is small; see `export.write_page`."""
+        if not self._exports or setup.selection.names["exporter"] == PAGE_EXPORTER:
+            return
+        (exported,) = self._exports.values()
+        with reporting(state):
+            page = write_page(setup, state, self.folder / PAGE, exported.gaussians)
+        if page is not None:
+            self._exports[PAGE] = page
 
     def summarise(
         self, setup: Setup, state: TrainState, status: Status, error: str | None = None

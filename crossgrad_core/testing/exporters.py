@@ -44,7 +44,12 @@ def writes_one_file(make: Make[Exporter]) -> None:
         require(
             file_names == ["a", "b"], f"two files were expected; the folder contains {file_names}"
         )
-        require(first.stat().st_size > 0, "the file is empty")
+        size, largest = first.stat().st_size, make().largest_size(len(_gaussians()))
+        require(size > 0, "the file is empty")
+        require(
+            largest is None or size <= largest,
+            f"the file has {size} bytes; largest_size() announces at most {largest}",
+        )
         same = first.read_bytes() == second.read_bytes()
         require(same, "two exports of the same Gaussians differ")
 

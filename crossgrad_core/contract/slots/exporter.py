@@ -42,6 +42,7 @@ class ExportContent:
         to_ecef: [4, 4] float64, maps coordinates of the file to ECEF metres on the WGS 84
             ellipsoid; None if the location is not known.
         comments: Lines of plain text about the file, for formats that can hold them.
+        name: Name of the scene.
     """
 
     gaussians: Gaussians
@@ -50,6 +51,7 @@ class ExportContent:
     up: NDArray[np.float64] | None = None
     to_ecef: NDArray[np.float64] | None = None
     comments: tuple[str, ...] = ()
+    name: str = "scene"
 
 
 class Exporter(Component):
@@ -62,6 +64,8 @@ class Exporter(Component):
         coordinates: The default of `--coordinates`, if the scene can be exported in them.
         lossy: True if the file approximates the Gaussians; then the loss in dB is measured.
         responses: The responses of Gaussians that the format can store.
+        keeps_response: True if all viewers of the format draw these responses as crossgrad does.
+            Then Gaussians keep the response of their backbone, and are not baked for it.
     """
 
     slot: ClassVar[str] = "exporters"
@@ -70,6 +74,7 @@ class Exporter(Component):
     coordinates: ClassVar[str] = INPUT
     lossy: ClassVar[bool] = False
     responses: ClassVar[frozenset[Response]] = frozenset({"plain"})
+    keeps_response: ClassVar[bool] = False
 
     @abstractmethod
     def write(self, content: ExportContent, path: Path) -> tuple[str, ...]:
@@ -85,6 +90,13 @@ class Exporter(Component):
         Raises:
             UserError: The disk is full, or the folder is not writable.
         """
+
+    def largest_size(self, gaussians: int) -> int | None:
+        """Return an upper limit of the size in bytes of a file with this number of Gaussians.
+
+        Cameras are not counted. By default None: the exporter does not know a limit.
+        """
+        return None
 
     def rounding(self, gaussians: Gaussians, similarity: Similarity) -> Rounding:
         """Return offset and rounding error of positions in the file that `write` creates."""
