@@ -6,13 +6,9 @@ from typing import ClassVar
 from typing_extensions import override
 
 from crossgrad_core.plugin import ExportContent, Exporter, Gaussians, Response, Rounding, Similarity
+from crossgrad_plugins.exporters.file_units import FileCloud
 from crossgrad_plugins.exporters.ply_cloud import SplatCloud
-from crossgrad_plugins.exporters.ply_file import (
-    position_rounding,
-    read_ply,
-    sh_degree_of,
-    write_ply,
-)
+from crossgrad_plugins.exporters.ply_file import read_ply, sh_degree_of, write_ply
 
 
 class Ply(Exporter):
@@ -28,7 +24,7 @@ class Ply(Exporter):
 
     @override
     def rounding(self, gaussians: Gaussians, similarity: Similarity) -> Rounding:
-        return position_rounding(SplatCloud.from_gaussians(gaussians), similarity)
+        return FileCloud.of(SplatCloud.from_gaussians(gaussians), similarity).float32_rounding
 
     @override
     def stored(self, gaussians: Gaussians, similarity: Similarity) -> Gaussians:

@@ -6,7 +6,6 @@ little-endian. `f_rest` is channel-major: 15 red coefficients, 15 green, 15 blue
 
 import re
 from collections.abc import Collection, Sequence
-from math import floor, log10
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +14,13 @@ from numpy.typing import NDArray
 from crossgrad_core.numerics.raster_constants import COEFFICIENTS
 from crossgrad_core.plugin import (
     COORDINATES_TAG,
-    Rounding,
     Similarity,
     UserError,
     atomic_file,
     read_vertices,
     vertex_properties,
 )
+from crossgrad_plugins.exporters.file_units import FileCloud, plain_number
 from crossgrad_plugins.exporters.ply_cloud import REST, RenderMode, SplatCloud
 
 #: Names of the properties in the order of the file.
@@ -34,9 +33,6 @@ PROPERTIES = (
     *(f"rot_{i}" for i in range(4)),
 )
 _NEEDED = tuple(name for name in PROPERTIES if not name.startswith(("n", "f_rest_")))
-#: Largest error of positions from rounding to float32, in local units.
-POSITION_TOLERANCE = 1e-6
-
 _OFFSET_TAG = "crossgrad_offset:"
 _MODE_TAG = "SplatRenderMode:"
 _CHUNK = 65_536
@@ -57,9 +53,8 @@ def write_ply(
 ) -> tuple[str, ...]:
     """Write a cloud of the local frame in input coordinates; only a complete file appears.
 
-    Large input coordinates (UTM, ECEF) can be too coarse in float32. If rounding would move
-    Gaussians by more than 1e-6 local units, positions are written relative to a rounded offset. The
-    offset is written to a comment `crossgrad_offset: x y z`, and `read_ply` adds it again.
+    Positions are relative to the offset of `FileCloud`. The offset is written to a comment
+    `crossgrad_offset: x y z`, and `read_ply` adds it again.
 
     Args:
         path: The file.
@@ -73,55 +68,17 @@ def write_ply(
     Raises:
         UserError: The disk is full or the folder is not writable.
     """
-    notes = []
-    offset = position_offset(similarity)
-    moved = cloud.to_input(Similarity(similarity.offset - offset, similarity.scale))
-    valid = _representable(moved)
-    if not valid.all():
-        moved = moved.selected(valid)
-        notes.append(
-            f"{path.name}: {np.sum(~valid):,} Gaussians left out, because they are not finite"
-        )
+    units = FileCloud.of(cloud, similarity, path.name)
+    moved = units.cloud
     tags = [f"{_MODE_TAG} {cloud.render_mode}"]
-    if offset.any():
-        text = " ".join(_plain(value) for value in offset)
-        tags.append(f"{_OFFSET_TAG} {text}")
-        notes.append(
-            f"{path.name}: coordinates are relative to {text}, because float32 is not "
-            "precise enough"
-        )
+    if units.offset.any():
+        tags.append(f"{_OFFSET_TAG} {' '.join(plain_number(value) for value in units.offset)}")
     header = _header(len(moved), [*tags, *comments])
     with atomic_file(path, len(header) + 4 * len(PROPERTIES) * len(moved)) as file:
         file.write(header)
         for start in range(0, len(moved), _CHUNK):
             file.write(_rows(moved, slice(start, start + _CHUNK)).tobytes())
-    return tuple(notes)
-
-
-def position_rounding(cloud: SplatCloud, similarity: Similarity) -> Rounding:
-    """Return the offset and the largest rounding error of positions in `write_ply`."""
-    offset = position_offset(similarity)
-    moved = cloud.to_input(Similarity(similarity.offset - offset, similarity.scale))
-    means = moved.selected(_representable(moved)).means
-    off = np.abs(means.astype(np.float32) - means)
-    return Rounding(offset, float(off.max(initial=0.0)))
-
-
-def position_offset(similarity: Similarity) -> NDArray[np.float64]:
-    """Return [3] the offset to subtract from input coordinates before rounding to float32.
-
-    The offset is zero unless rounding would move a Gaussian by more than `POSITION_TOLERANCE`.
-    Otherwise the offset is the centre of the scene, rounded to a power of ten of at most one local
-    unit.
-    """
-    largest = np.float32(np.abs(similarity.offset).max())
-    error = 0.5 * float(np.spacing(largest)) * similarity.scale  # local units
-    if error <= POSITION_TOLERANCE:
-        return np.zeros(3)
-    exponent = floor(log10(1.0 / similarity.scale))
-    # Adding 0 avoids negative zeros
-    offset: NDArray[np.float64] = np.round(similarity.offset, -exponent) + 0.0
-    return offset
+    return units.notes
 
 
 def read_ply(path: Path) -> SplatCloud:
@@ -176,25 +133,11 @@ def sh_degree_of(path: Path) -> int:
     return COEFFICIENTS.index(1 + len(_rest_names(properties, path)) // 3)
 
 
-def _plain(value: float) -> str:
-    """Return a number without exponent or needless digits; float(text) gives the same bits."""
-    return np.format_float_positional(value, trim="-")
-
-
 def _header(count: int, comments: Sequence[str]) -> bytes:
     lines = ["ply", "format binary_little_endian 1.0"]
     lines += [f"comment {' '.join(text.split())}" for text in comments]
     lines += [f"element vertex {count}", *(f"property float {name}" for name in PROPERTIES)]
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii", errors="replace")
-
-
-def _representable(cloud: SplatCloud) -> NDArray[np.bool_]:
-    """Return [N] bool: Gaussians whose values are all finite in float32."""
-    valid = (np.abs(cloud.means) <= np.finfo(np.float32).max).all(axis=1)
-    valid &= np.isfinite(cloud.logit_opacities)
-    for array in (cloud.log_scales, cloud.quats, cloud.sh_dc, cloud.sh_rest):
-        valid &= np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
-    return valid
 
 
 def _rows(cloud: SplatCloud, rows: slice) -> NDArray[np.float32]:

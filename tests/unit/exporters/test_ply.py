@@ -11,13 +11,9 @@ import torch
 from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.georeference import Similarity
 from crossgrad_core.errors import UserError
+from crossgrad_plugins.exporters.file_units import position_offset
 from crossgrad_plugins.exporters.ply_cloud import SplatCloud
-from crossgrad_plugins.exporters.ply_file import (
-    PROPERTIES,
-    position_offset,
-    read_ply,
-    write_ply,
-)
+from crossgrad_plugins.exporters.ply_file import PROPERTIES, read_ply, write_ply
 
 UTM = Similarity(np.array([355_142.5, 5_812_377.25, 81.0]), 1 / 60)
 
