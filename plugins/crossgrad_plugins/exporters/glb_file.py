@@ -54,8 +54,7 @@ def write_container(
     total = HEADER.size + 2 * CHUNK_HEADER.size + len(text) + filled
     file.write(HEADER.pack(GLB, 2, total) + CHUNK_HEADER.pack(len(text), JSON) + text)
     file.write(CHUNK_HEADER.pack(filled, BIN))
-    for part in content:
-        file.write(part)
+    file.writelines(content)
     file.write(bytes(filled - size))
 
 

@@ -199,9 +199,7 @@ def _cloud(glb: _Glb, primitive: dict[str, Any]) -> SplatCloud:
     return cloud
 
 
-def _placed(
-    cloud: SplatCloud, matrix: NDArray[np.float64], similarity: Similarity
-) -> Gaussians:
+def _placed(cloud: SplatCloud, matrix: NDArray[np.float64], similarity: Similarity) -> Gaussians:
     """Return the Gaussians of a node in the local frame."""
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     if not np.isfinite(matrix).all() or scale <= 0:

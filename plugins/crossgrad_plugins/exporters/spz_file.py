@@ -112,9 +112,7 @@ class SpzTable:
         rest[:, :used] = ((self.harmonics.astype(np.float32) - 128) / _SH_STEPS).reshape(
             count, used, 3
         )
-        opacities = np.clip(
-            self.opacities[:, 0] / 255.0, _OPACITY_MARGIN, 1.0 - _OPACITY_MARGIN
-        )
+        opacities = np.clip(self.opacities[:, 0] / 255.0, _OPACITY_MARGIN, 1.0 - _OPACITY_MARGIN)
         rotations = _three if self.version == VERSIONS[0] else _smallest_three
         return SplatCloud(
             means=self.means,

@@ -100,9 +100,7 @@ def _stored(cloud: SplatCloud, part: Part) -> SplatCloud:
     return SplatCloud.joined(clouds).selected(order)
 
 
-def _place(
-    to_ecef: NDArray[np.float64] | None, offset: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _place(to_ecef: NDArray[np.float64] | None, offset: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the transform [4, 4] of the root of the tiles."""
     moved = np.eye(4)
     moved[:3, 3] = offset

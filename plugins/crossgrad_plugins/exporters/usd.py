@@ -1,4 +1,4 @@
-"""USD, the scene format of Pixar: Gaussians in a usdz package for Omniverse, Houdini and usdview."""
+"""USD, the scene format of Pixar: Gaussians in a usdz package."""
 
 import os
 from collections.abc import Iterator
@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,10 @@ from crossgrad_core.plugin import (
 from crossgrad_plugins.exporters.file_units import FileCloud
 from crossgrad_plugins.exporters.ply_cloud import SplatCloud
 from crossgrad_plugins.exporters.spz_file import unit_quaternions
+
+if TYPE_CHECKING:
+    from pxr.Usd import Stage
+    from pxr.Vt import Vec3fArray
 
 _NAME: Final = "gaussians"
 
@@ -56,7 +60,7 @@ class Usd(Exporter):
 
 @contextmanager
 def _folder_beside(path: Path) -> Iterator[Path]:
-    """Yield a folder on the disk of the file; the name shows later commands that it is left over."""
+    """Yield a folder on the disk of the file; later commands delete a left-over one by its name."""
     end = f".{os.getpid()}.tmp"
     with TemporaryDirectory(prefix=f".{path.name}.", suffix=end, dir=path.parent) as folder:
         yield Path(folder)
@@ -85,7 +89,7 @@ def _packed(content: ExportContent, units: FileCloud, folder: Path) -> Path:
     return package
 
 
-def _define(stage: Any, units: FileCloud) -> None:
+def _define(stage: "Stage", units: FileCloud) -> None:
     """Add the Gaussians to a stage of USD."""
     from pxr import Gf, UsdGeom, UsdVol, Vt
 
@@ -117,7 +121,7 @@ def _define(stage: Any, units: FileCloud) -> None:
     harmonics.SetMetadata("interpolation", UsdGeom.Tokens.vertex)
 
 
-def _vectors(values: NDArray[Any]) -> Any:
+def _vectors(values: NDArray[Any]) -> "Vec3fArray":
     """Return [N, 3] numbers as an array of USD."""
     from pxr import Vt
 
