@@ -71,8 +71,9 @@ def exported(
         find("exporters", file_format)
     with writing(folder, out, "exporting"):
         if out is not None:
+            if not out.is_dir() or _writes_folder(file_format):
+                check_new(out, georef_of(out))
             check_file(out)
-            check_new(out, georef_of(out))
             clear_leftovers(out.parent, shared=True)
         setup, state = how.open(folder)
         # If the exporter is the run's exporter, use the options of the run.
@@ -98,6 +99,11 @@ def exported(
             check_new(path)
         with relisted(folder, *(() if out else (path.name, georef_of(path).name))):
             return path, export_scene(setup, state, path, exporter, options)
+
+
+def _writes_folder(file_format: str | None) -> bool:
+    """Return True if a format is known to be a folder; None is the unknown format of the run."""
+    return file_format is not None and not build(Exporter, file_format, {}).suffix
 
 
 def _check_name(out: Path | None, exporter: Exporter) -> None:
