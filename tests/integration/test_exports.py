@@ -38,9 +38,7 @@ from crossgrad_plugins.exporters.tiles import Tiles
 def trained(tmp_path_factory):
     """A run of a few steps on a scene with a place on Earth."""
     folder = tmp_path_factory.mktemp("trained")
-    scene = located(
-        write_tiny_scene(folder / "tiny", views=10, width=24, height=16, suffix=".jpg")
-    )
+    scene = located(write_tiny_scene(folder / "tiny", views=10, width=24, height=16, suffix=".jpg"))
     given = {"scene": str(scene), "out": str(folder / "run"), "steps": 4, "threads": 1}
     assert app.run({**given, "initializer": {"name": "points"}}, verbosity=-1) == 0
     return folder / "run"
@@ -151,7 +149,9 @@ def test_max_gaussians_keeps_those_that_contribute_most_and_reports_the_loss(ope
     number = len(baked) // 2
     options = ExportOptions(max_gaussians=number)
     half = export_scene(setup, state, tmp_path / "a.ply", options=options)
-    more = export_scene(setup, state, tmp_path / "b.ply", options=ExportOptions(max_gaussians=10**9))
+    more = export_scene(
+        setup, state, tmp_path / "b.ply", options=ExportOptions(max_gaussians=10**9)
+    )
     assert half.gaussians == number and more.gaussians == len(baked)
     assert half.loss is not None and more.loss == pytest.approx(0.0, abs=1e-6)
 
@@ -192,7 +192,9 @@ def test_cameras_that_are_turned_alike_see_the_same_image(opened, axis, coordina
         torch.testing.assert_close(*images, atol=2e-4, rtol=0)
 
 
-@pytest.mark.parametrize("options", [{}, {"up": "y"}, {"up": "z"}, {"coordinates": "enu", "up": "y"}])
+@pytest.mark.parametrize(
+    "options", [{}, {"up": "y"}, {"up": "z"}, {"coordinates": "enu", "up": "y"}]
+)
 def test_the_georef_file_of_a_turned_export_leads_to_the_same_places(opened, tmp_path, options):
     setup, state = opened
     export_scene(setup, state, tmp_path / "a.ply")
@@ -200,7 +202,9 @@ def test_the_georef_file_of_a_turned_export_leads_to_the_same_places(opened, tmp
     facts, places, inputs = [], [], []
     for name in ("a.ply", "b.ply"):
         beside = json.loads((tmp_path / f"{name}.georef.json").read_text())
-        points = np.column_stack([read_plain(tmp_path / name), np.ones(len(read_plain(tmp_path / name)))])
+        points = np.column_stack(
+            [read_plain(tmp_path / name), np.ones(len(read_plain(tmp_path / name)))]
+        )
         facts.append(beside)
         places.append(points @ np.array(beside["transform"]).T)
         inputs.append(points @ np.array(beside["to_input"]).T)
@@ -222,7 +226,11 @@ def test_tiles_stand_at_the_place_of_the_georeference(opened, tmp_path):
     place = np.array(root["transform"]).reshape(4, 4).T
     # East, north and up of the place, in geocentric axes.
     latitude, longitude = (np.radians(beside["origin"][name]) for name in ("latitude", "longitude"))
-    up = [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)]
+    up = [
+        np.cos(latitude) * np.cos(longitude),
+        np.cos(latitude) * np.sin(longitude),
+        np.sin(latitude),
+    ]
     np.testing.assert_allclose(place[:3, 2], up, atol=1e-9)
     np.testing.assert_allclose(place[:3, 0], [-np.sin(longitude), np.cos(longitude), 0], atol=1e-9)
     assert 6.3e6 < np.linalg.norm(place[:3, 3]) < 6.4e6

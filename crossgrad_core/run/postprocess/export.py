@@ -90,7 +90,8 @@ def exported(
                 todo="leave --camera out",
             )
         words = [CLOUD, *_differences(setup, options)]
-        kind = f".{exporter.suffix}" if exporter.suffix else f"_{file_format}"
+        of_run = setup.selection.names["exporter"]
+        kind = f".{exporter.suffix}" if exporter.suffix else f"_{file_format or of_run}"
         name = f"{'_'.join(words)}{kind}"
         if words == [CLOUD] and exporter.suffix:
             path = out or folder / own_name(folder, name, state.step)

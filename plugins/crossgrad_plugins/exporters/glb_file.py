@@ -155,7 +155,7 @@ def _columns(cloud: SplatCloud) -> Iterator[tuple[str, int, int, Any]]:
 
     def colors(rows: slice) -> NDArray[Any]:
         drawn = np.concatenate([cloud.sh_dc[rows] * SH_C0 + 0.5, opacities(rows)], axis=1)
-        return np.rint(np.clip(drawn, 0, 1) * 255)
+        return np.asarray(np.rint(np.clip(drawn, 0, 1) * 255))
 
     def rotations(rows: slice) -> NDArray[Any]:
         return unit_quaternions(cloud.quats[rows])

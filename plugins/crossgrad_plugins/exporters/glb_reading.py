@@ -112,7 +112,8 @@ def degree_of(path: Path) -> int:
 
 def _opened(path: Path) -> _Glb:
     raw = content_of(path)
-    start, chunks = HEADER.size, {}
+    start = HEADER.size
+    chunks: dict[bytes, bytes] = {}
     if raw[:4] != GLB:
         raise _damaged(path, "another header")
     while start + CHUNK_HEADER.size <= len(raw):

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import log
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -117,7 +117,9 @@ class SplatCloud:
     def joined(cls, clouds: "Sequence[SplatCloud]") -> "SplatCloud":
         """Return the Gaussians of all clouds, at least one, with the mode of the first."""
         names = ("means", "log_scales", "quats", "logit_opacities", "sh_dc", "sh_rest")
-        arrays = {name: np.concatenate([getattr(each, name) for each in clouds]) for name in names}
+        arrays: dict[str, Any] = {
+            name: np.concatenate([getattr(each, name) for each in clouds]) for name in names
+        }
         return replace(clouds[0], **arrays)
 
     def _mapped(self, means: NDArray[np.float64], log_scale: float) -> "SplatCloud":

@@ -248,7 +248,7 @@ def _widths(version: int, degree: int) -> tuple[int, ...]:
 
 
 def _rounded(values: NDArray[Any]) -> NDArray[Any]:
-    return np.clip(np.rint(values), 0, 255)
+    return np.asarray(np.clip(np.rint(values), 0, 255))
 
 
 def _fixed_point(means: NDArray[np.float64], bits: int) -> Bytes:
@@ -294,7 +294,7 @@ def _packed_smallest_three(quats: NDArray[np.float32]) -> Bytes:
     packed = largest.astype(np.uint32)
     for axis in range(4):
         packed = np.where(largest == axis, packed, packed << 10 | numbers[:, axis])
-    return packed.astype("<u4")[:, None].view(np.uint8)
+    return np.asarray(packed.astype("<u4")[:, None].view(np.uint8))
 
 
 def _smallest_three(table: Bytes) -> NDArray[np.float32]:
@@ -316,4 +316,4 @@ def _harmonics(rest: NDArray[np.float32]) -> Bytes:
     merged = np.full((rest.shape[1], 1), _STEP_REST, np.float32)
     merged[:_FIRST_BAND] = _STEP_FIRST
     steps = np.rint(rest * (_SH_STEPS / merged)) * merged + _SH_STEPS
-    return np.clip(steps, 0, 255).astype(np.uint8).reshape(len(rest), -1)
+    return np.asarray(np.clip(steps, 0, 255).astype(np.uint8).reshape(len(rest), -1))

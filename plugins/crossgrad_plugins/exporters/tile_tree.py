@@ -81,16 +81,16 @@ def written_tiles(
     Returns:
         The tile of the part, and its Gaussians.
     """
+    tiles: tuple[Tile, ...] = ()
     if not part.children:
-        content, boxes, tiles = cloud.selected(part.rows), [], ()
+        content = cloud.selected(part.rows)
     else:
         below = [written_tiles(cloud, child, write) for child in part.children]
         together = SplatCloud.joined([gaussians for _, gaussians in below])
         content = merged(together)
         tiles = tuple(tile for tile, _ in below)
-        boxes = [tile.box for tile in tiles]
     write(part.name, content)
-    corners = np.stack([_box(content), *boxes])
+    corners = np.stack([_box(content), *(tile.box for tile in tiles)])
     box = np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
     return Tile(part.name, box, tiles), content
 

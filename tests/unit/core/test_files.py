@@ -115,9 +115,13 @@ def test_a_file_name_that_is_too_long_is_a_user_error(tmp_path):
 
 
 def test_a_folder_appears_as_a_whole_or_not_at_all(tmp_path: Path):
-    with pytest.raises(RuntimeError), atomic_folder(tmp_path / "a") as folder:
-        (folder / "part").write_bytes(b"1")
-        raise RuntimeError
+    def fail() -> None:
+        with atomic_folder(tmp_path / "a") as folder:
+            (folder / "part").write_bytes(b"1")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
     assert not [*tmp_path.iterdir()]
     with atomic_folder(tmp_path / "a") as folder:
         (folder / "part").write_bytes(b"1")

@@ -99,7 +99,11 @@ def test_a_glb_file_has_the_attributes_of_the_extension(tmp_path: Path, degree):
     np.testing.assert_allclose(np.linalg.norm(turned, axis=1), 1, atol=1e-6)
     assert rotation_error(turned, given.quats) < 1e-3
     bands = {0: given.sh_dc, 1: given.sh_rest}
-    names = [f"{SPLATS}:SH_DEGREE_{l}_COEF_{n}" for l in range(degree + 1) for n in range(2 * l + 1)]  # noqa: E741
+    names = [
+        f"{SPLATS}:SH_DEGREE_{band}_COEF_{number}"
+        for band in range(degree + 1)
+        for number in range(2 * band + 1)
+    ]
     expected = torch.cat([band for band in bands.values() if band is not None], dim=1)
     for number, name in enumerate(names):
         np.testing.assert_array_equal(found[name], expected[:, number])

@@ -35,7 +35,9 @@ def cloud_of(path: Path) -> SplatCloud:
     assert document["extensionsRequired"] == BOTH
     primitive = document["meshes"][0]["primitives"][0]
     view = primitive["extensions"][BOTH[0]]["extensions"][BOTH[1]]["bufferView"]
-    cloud = SpzTable.unpacked(binary[: document["bufferViews"][view]["byteLength"]], path).to_cloud()
+    cloud = SpzTable.unpacked(
+        binary[: document["bufferViews"][view]["byteLength"]], path
+    ).to_cloud()
     assert all(a["count"] == len(cloud) for a in document["accessors"])
     assert all("bufferView" not in a for a in document["accessors"])
     return cloud
@@ -140,7 +142,9 @@ def test_a_merged_gaussian_has_the_moments_of_those_that_it_replaces():
     axes = rotation_matrices(quats).numpy() * sizes[:, None]
     points = cloud.means[who] + np.einsum("nij,nj->ni", axes[who], rng.normal(size=(len(who), 3)))
     np.testing.assert_allclose(merged.means[0], points.mean(axis=0), atol=0.05)
-    own = rotation_matrices(torch.from_numpy(merged.quats)).numpy()[0] * np.exp(merged.log_scales[0])
+    own = rotation_matrices(torch.from_numpy(merged.quats)).numpy()[0] * np.exp(
+        merged.log_scales[0]
+    )
     np.testing.assert_allclose(own @ own.T, np.cov(points.T), atol=0.2)
     np.testing.assert_allclose(merged.sh_dc[0], shares @ cloud.sh_dc, rtol=1e-5)
     area = np.sort(np.exp(merged.log_scales[0]))[1:].prod()
