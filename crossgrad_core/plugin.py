@@ -131,7 +131,7 @@ from crossgrad_core.run.results.log import (
     progress_line,
 )
 from crossgrad_core.scene.bimodality import ONE_MODE, bimodality
-from crossgrad_core.system.files import atomic_file, size_text
+from crossgrad_core.system.files import atomic_file, atomic_folder, size_text
 from crossgrad_core.system.input_files import is_file, open_file, read_file
 from crossgrad_core.system.ply_table import read_vertices, vertex_properties
 from crossgrad_core.system.terminal import controls_of, shows_bar
@@ -245,6 +245,7 @@ __all__ = [
     "Weighting",
     "apply_to_parameters",
     "atomic_file",
+    "atomic_folder",
     "bimodality",
     "build_component",
     "centers_of",

@@ -54,7 +54,7 @@ from crossgrad_core.run.results.plugins_file import (
 )
 from crossgrad_core.run.results.scene_file import write_scene
 from crossgrad_core.run.results.summary import final_table, summarised_step
-from crossgrad_core.run.session import CLOUD, Session, totals
+from crossgrad_core.run.session import Session, cloud_name, totals
 from crossgrad_core.run.settings import layered, parsed, with_recipe
 from crossgrad_core.run.unused_settings import (
     refuse_labels_for_nothing,
@@ -460,10 +460,10 @@ def resumed(
         setup, state = continued(folder, settings, way.displays, **accepted)
         step, total = state.step, setup.schedule.total
         done = step >= total and summarised_step(folder, "finished") == step
-        files = PER_VIEW, f"{CLOUD}.{setup.selection.exporter.suffix}"
+        files = PER_VIEW, cloud_name(setup.selection.exporter)
         # Leave out the configuration file, because its settings are compared separately.
         damaged = set(changed_files(folder)) - {CONFIG}
-        if done and not damaged and all((folder / name).is_file() for name in files):
+        if done and not damaged and all((folder / name).exists() for name in files):
             raise UserError(
                 "the run is finished, so that it cannot be resumed",
                 where=folder,

@@ -7,6 +7,7 @@ from pathlib import Path
 from time import perf_counter
 
 from crossgrad_core.contract.contexts import EvaluationReport
+from crossgrad_core.contract.slots.exporter import Exporter
 from crossgrad_core.defaults import PAGE_EXPORTER
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import evaluate
@@ -28,6 +29,7 @@ from crossgrad_core.run.results.metrics_csv import (
 )
 from crossgrad_core.run.results.panels import PanelWriter
 from crossgrad_core.run.results.summary import Status, Summary, write_summary
+from crossgrad_core.system.files import remove
 from crossgrad_core.training.memory import peak_mebibytes
 from crossgrad_core.training.per_image_params import PHOTO_VALUES, write_photos
 from crossgrad_core.training.setup import Setup
@@ -178,8 +180,10 @@ class Session:
 
     def export(self, setup: Setup, state: TrainState) -> None:
         """Write the trained scene and log a description of the file."""
-        path = self.folder / f"{CLOUD}.{setup.selection.exporter.suffix}"
+        path = self.folder / cloud_name(setup.selection.exporter)
         with reporting(state):
+            if path.is_dir():
+                remove(path)  # A folder of an earlier step of the run.
             self._exports = {path.name: export_scene(setup, state, path)}
             write_photos(setup, state, self.folder / PHOTO_VALUES)
         for line in described(self._exports[path.name], path):
@@ -217,6 +221,11 @@ class Session:
             error=error,
         )
         write_summary(self.folder, summary)
+
+
+def cloud_name(exporter: Exporter) -> str:
+    """Return the name of the file or folder to which a run exports its scene."""
+    return f"{CLOUD}.{exporter.suffix}" if exporter.suffix else CLOUD
 
 
 @contextmanager

@@ -127,6 +127,31 @@ def atomic_file(path: Path, needed: int | None = None) -> Iterator[BinaryIO]:
             UNFINISHED.discard(str(temporary))
 
 
+@contextmanager
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """Yield a new folder that gets the name `path` when the block ends without an error.
+
+    Raises:
+        UserError: The disk is full, the parent folder is not writable, or `path` exists.
+    """
+    temporary = unfinished_name(path)
+    with disk_errors(path):
+        if os.path.lexists(path):
+            raise FileExistsError(errno.EEXIST, "the folder exists already")
+        UNFINISHED.add(str(temporary))
+        try:
+            temporary.mkdir()
+            yield temporary
+            for written in temporary.rglob("*"):
+                if written.is_file():
+                    sync_file(written)
+            temporary.rename(path)
+            sync_folder(path.parent)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+            UNFINISHED.discard(str(temporary))
+
+
 def unfinished_name(path: Path) -> Path:
     """Return the temporary name of a file that is not complete yet."""
     return path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -138,7 +163,7 @@ def is_leftover(path: Path) -> bool:
 
 
 def clear_leftovers(folder: Path, *, shared: bool = False) -> None:
-    """Delete the half-written files that killed processes left in a folder.
+    """Delete the half-written files and folders that killed processes left in a folder.
 
     Args:
         folder: The folder.
@@ -148,7 +173,15 @@ def clear_leftovers(folder: Path, *, shared: bool = False) -> None:
     for path in folder.glob(".*.tmp"):
         named = _TEMPORARY.fullmatch(path.name)
         if named and not (shared and _is_alive(int(named[1]))):
-            path.unlink(missing_ok=True)
+            remove(path)
+
+
+def remove(path: Path) -> None:
+    """Delete a file, or a folder with its content, if it exists."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _is_alive(process: int) -> bool:

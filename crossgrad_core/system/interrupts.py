@@ -18,7 +18,7 @@ SIGNALS = tuple(
 )
 #: Lines that tell the user how to continue after an immediate end. The newest line is last.
 _WAYS_ON: list[str] = []
-#: Files that are being written. These files are deleted if the process ends immediately.
+#: Files and folders that are being written. They are deleted if the process ends immediately.
 UNFINISHED: set[str] = set()
 #: Numbers of the processes that write unfinished files. These processes are ended before the files
 #: are deleted.
@@ -66,7 +66,12 @@ def end_at_once(number: int, _frame: FrameType | None) -> None:
             os.waitpid(helper, 0)
     for path in list(UNFINISHED):
         with suppress(OSError):
-            os.unlink(path)
+            if os.path.isdir(path):
+                import shutil  # Whoever writes a folder has imported it already.
+
+                shutil.rmtree(path)
+            else:
+                os.unlink(path)
     os._exit(exit_code(number))
 
 

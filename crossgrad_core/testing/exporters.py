@@ -19,14 +19,14 @@ _ROUNDING = 1e-5
 
 
 def has_a_suffix(make: Make[Exporter]) -> None:
-    """`suffix` is the suffix of the exporter's file names, without the dot."""
+    """`suffix` is the suffix of the exporter's file names, without the dot; empty for a folder."""
     suffix = getattr(make(), "suffix", None)
-    good = isinstance(suffix, str) and suffix.isalnum() and suffix == suffix.lower()
+    good = isinstance(suffix, str) and (suffix.isalnum() or not suffix) and suffix == suffix.lower()
     require(good, f"suffix is {suffix!r}; it must be lower-case letters and digits, without a dot")
 
 
 def writes_one_file(make: Make[Exporter]) -> None:
-    """Only the named file is written.
+    """Only the named file or folder is written.
 
     Equal Gaussians give equal bytes, and `write` does not change the Gaussians.
     """
@@ -44,18 +44,21 @@ def writes_one_file(make: Make[Exporter]) -> None:
         require(
             file_names == ["a", "b"], f"two files were expected; the folder contains {file_names}"
         )
-        size, largest = first.stat().st_size, make().largest_size(len(_gaussians()))
-        require(size > 0, "the file is empty")
-        require(
-            largest is None or size <= largest,
-            f"the file has {size} bytes; largest_size() announces at most {largest}",
-        )
-        same = first.read_bytes() == second.read_bytes()
+        require(any(_content(first).values()), "the file is empty")
+        if first.is_file():
+            size, largest = first.stat().st_size, make().largest_size(len(_gaussians()))
+            require(
+                largest is None or size <= largest,
+                f"the file has {size} bytes; largest_size() announces at most {largest}",
+            )
+        same = _content(first) == _content(second)
         require(same, "two exports of the same Gaussians differ")
 
 
 def appears_at_once(make: Make[Exporter]) -> None:
     """An existing file is replaced as a whole. The exporter never overwrites a file in place."""
+    if not make().suffix:
+        raise cannot_tell("the exporter writes a folder, which is never replaced")
     with TemporaryDirectory() as folder:
         path = Path(folder) / "a"
         make().write(ExportContent(_gaussians(), _FRAME), path)
@@ -79,12 +82,13 @@ def writes_the_input_frame(make: Make[Exporter]) -> None:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "a"
         exporter.write(ExportContent(given, _FRAME), path)
-        written, rounding = path.read_bytes(), exporter.rounding(given, _FRAME)
+        written, rounding = _content(path), exporter.rounding(given, _FRAME)
         for similarity, what in ((offset, "offset"), (scale, "scale")):
+            path = Path(folder) / what
             exporter.write(ExportContent(given, similarity), path)
             moved = not np.array_equal(exporter.rounding(given, similarity).offset, rounding.offset)
             require(
-                path.read_bytes() != written or moved,
+                _content(path) != written or moved,
                 f"another {what} of the similarity gives the same file: write() writes the "
                 "local frame; expected the input frame: positions by similarity.to_input, "
                 "lengths divided by similarity.scale",
@@ -128,6 +132,12 @@ def the_stored_ones_can_be_drawn(make: Make[Exporter]) -> None:
     for name in ("means", "quats", "scales", "opacities"):
         require(getattr(stored, name).isfinite().all(), f"the stored {name} are not finite")
     _require_kept(given, "stored")
+
+
+def _content(path: Path) -> dict[str, bytes]:
+    """Return the bytes of a file, or of all files of a folder by their names."""
+    files = [path] if path.is_file() else [each for each in path.rglob("*") if each.is_file()]
+    return {each.relative_to(path).as_posix(): each.read_bytes() for each in files}
 
 
 def _require_kept(given: Gaussians, method: str) -> None:

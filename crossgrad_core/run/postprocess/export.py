@@ -73,8 +73,9 @@ def exported(
         find("exporters", file_format)
     with writing(folder, out, "exporting"):
         if out is not None:
+            if not out.is_dir() or _writes_folder(file_format):
+                check_new(out, georef_of(out))
             check_file(out)
-            check_new(out, georef_of(out))
             clear_leftovers(out.parent, shared=True)
         setup, state = how.open(folder)
         # If the exporter is the run's exporter, use the options of the run.
@@ -90,20 +91,41 @@ def exported(
                 where="--camera",
                 todo="leave --camera out",
             )
-        words = [CLOUD, *_differences(setup, options)]
-        kind = f".{exporter.suffix}" if exporter.suffix else f"_{file_format}"
-        name = f"{'_'.join(words)}{kind}"
-        if words == [CLOUD] and exporter.suffix:
-            path = out or folder / own_name(folder, name, state.step)
-        else:
-            path = out or folder / name
-            check_new(path)
+        path = out or _default_path(folder, setup, state.step, exporter, file_format, options)
         own = () if out else (path.name, georef_of(path).name, SUMMARY)
         with relisted(folder, *own):
             content = export_scene(setup, state, path, exporter, options)
             if out is None and summarised_step(folder) == state.step:
                 add_export(folder, path.name, content.as_data())
             return path, content
+
+
+def _default_path(
+    folder: Path,
+    setup: Setup,
+    step: int,
+    exporter: Exporter,
+    file_format: str | None,
+    options: ExportOptions,
+) -> Path:
+    """Return the path of an export below the folder of its run.
+
+    Only the export with defaults to a file replaces the file of an earlier export of this step.
+    """
+    words = [CLOUD, *_differences(setup, options)]
+    kind = f".{exporter.suffix}"
+    if not exporter.suffix:
+        kind = f"_{file_format or setup.selection.names['exporter']}"
+    name = f"{'_'.join(words)}{kind}"
+    if words == [CLOUD] and exporter.suffix:
+        return folder / own_name(folder, name, step)
+    check_new(folder / name)
+    return folder / name
+
+
+def _writes_folder(file_format: str | None) -> bool:
+    """Return True if a format is known to be a folder; None is the unknown format of the run."""
+    return file_format is not None and not build(Exporter, file_format, {}).suffix
 
 
 def _check_name(out: Path | None, exporter: Exporter) -> None:

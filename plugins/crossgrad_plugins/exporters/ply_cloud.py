@@ -1,8 +1,9 @@
 """Gaussians with spherical harmonics as arrays, in the units of the files."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import log
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -100,8 +101,8 @@ class SplatCloud:
         """Map a cloud of the input frame to the local frame."""
         return self._mapped(similarity.to_local(self.means), log(similarity.scale))
 
-    def selected(self, rows: NDArray[np.bool_]) -> "SplatCloud":
-        """Return the Gaussians that are marked in `rows` [N]."""
+    def selected(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> "SplatCloud":
+        """Return the Gaussians that are marked in `rows` [N] bool, or that have these numbers."""
         return replace(
             self,
             means=self.means[rows],
@@ -111,6 +112,15 @@ class SplatCloud:
             sh_dc=self.sh_dc[rows],
             sh_rest=self.sh_rest[rows],
         )
+
+    @classmethod
+    def joined(cls, clouds: "Sequence[SplatCloud]") -> "SplatCloud":
+        """Return the Gaussians of all clouds, at least one, with the mode of the first."""
+        names = ("means", "log_scales", "quats", "logit_opacities", "sh_dc", "sh_rest")
+        arrays: dict[str, Any] = {
+            name: np.concatenate([getattr(each, name) for each in clouds]) for name in names
+        }
+        return replace(clouds[0], **arrays)
 
     def _mapped(self, means: NDArray[np.float64], log_scale: float) -> "SplatCloud":
         # The similarity has no rotation, so quaternions and spherical harmonics do not change.

@@ -11,6 +11,7 @@ import pytest
 from crossgrad_core.errors import UserError
 from crossgrad_core.system.files import (
     atomic_file,
+    atomic_folder,
     clear_leftovers,
     disk_errors,
     free_bytes,
@@ -111,3 +112,29 @@ def test_temporary_files_of_living_processes_are_kept_in_a_shared_folder(tmp_pat
 def test_a_file_name_that_is_too_long_is_a_user_error(tmp_path):
     with pytest.raises(UserError, match="the path is too long"):
         write_atomically(tmp_path / ("a" * 250), b"")
+
+
+def test_a_folder_appears_as_a_whole_or_not_at_all(tmp_path: Path):
+    def fail() -> None:
+        with atomic_folder(tmp_path / "a") as folder:
+            (folder / "part").write_bytes(b"1")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
+    assert not [*tmp_path.iterdir()]
+    with atomic_folder(tmp_path / "a") as folder:
+        (folder / "part").write_bytes(b"1")
+        assert is_leftover(folder) and not (tmp_path / "a").exists()
+    assert (tmp_path / "a" / "part").read_bytes() == b"1"
+    with pytest.raises(UserError, match="already has this name"), atomic_folder(tmp_path / "a"):
+        pass
+    assert [item.name for item in tmp_path.iterdir()] == ["a"]
+
+
+def test_a_left_over_folder_is_deleted(tmp_path: Path):
+    folder = tmp_path / ".tiles.123456.tmp"
+    folder.mkdir()
+    (folder / "0.glb").touch()
+    clear_leftovers(tmp_path)
+    assert not [*tmp_path.iterdir()]
