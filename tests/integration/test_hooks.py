@@ -292,3 +292,34 @@ def test_render_scales_out_of_bounds_end_the_run_and_name_the_plugin(
     monkeypatch.setattr(NearAtHalf, "scales", lambda self, context, state: ((2.0, 1.0), state))
     with pytest.raises(UserError, match="returned a wrong scale"):
         run(scene, tmp_path / "run", resolution={"name": "near-at-half"})
+
+
+class Between(Observer):
+    """Pauses twice after each step, reads the model, and stops the run after step 3."""
+
+    def __init__(self, stops):
+        super().__init__()
+        self._calls, self._stops = [], stops
+
+    @hookimpl
+    def crossgrad_between_steps(self, model):
+        shown = model()
+        self._calls.append(shown.phase.step)
+        assert not shown.phase.training
+        if self._calls.count(shown.phase.step) < 3:
+            return "pause"
+        return "stop" if shown.phase.step == self._stops else None
+
+
+def test_a_plugin_pauses_and_stops_a_run_between_two_steps_without_changing_it(scene, tmp_path):
+    build, between = assemble.make_manager, Between(3)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            assemble, "make_manager", lambda plugins: build({**plugins, "between": between})
+        )
+        assert run(scene, tmp_path / "stopped", steps=6) == 0
+    assert between._calls == [1, 1, 1, 2, 2, 2, 3, 3, 3]
+    assert run(scene, tmp_path / "other", steps=6, stop_after=3) == 0
+    first, second = (load(latest(tmp_path / name)) for name in ("stopped", "other"))
+    assert first.step == second.step == 3
+    assert all(first.parameters[n].equal(second.parameters[n]) for n in second.parameters)

@@ -45,10 +45,12 @@ def layers_of(sources: list[Source]) -> tuple[Layer, ...]:
     """Return the layers that the sources can show, the default first."""
     drawn = [number for number, source in enumerate(sources) if source.draw is not None]
     has_photos = any(source.views for source in sources)
-    kinds: tuple[Kind, ...] = ("render", "error", "depth") if has_photos else ("render", "depth")
-    layers = [Layer(kind, number) for kind in kinds for number in drawn]
     photo = [Layer("photo")] if has_photos else []
-    return (*layers[: len(drawn)], *photo, *layers[len(drawn) :]) or (*photo, Layer("points"))
+    if not drawn:
+        return (*photo, Layer("points"))
+    kinds: tuple[Kind, ...] = ("error", "depth") if has_photos else ("depth",)
+    renders = [Layer("render", number) for number in drawn]
+    return (*renders, *photo, *(Layer(kind, number) for kind in kinds for number in drawn))
 
 
 @dataclass(frozen=True)
