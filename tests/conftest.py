@@ -94,7 +94,7 @@ def pytest_collection():
     compiled = Path(__file__).with_name("contract").glob("__pycache__/test_contracts.*-pytest-*")
     with Path(__file__).open() as lock:
         if not any(compiled):
-            with suppress(ImportError):  # On Windows.
+            with suppress(ImportError, OSError):  # Not on Windows, nor on every file system.
                 import fcntl
 
                 try:
