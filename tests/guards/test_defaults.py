@@ -26,7 +26,7 @@ WORDS = {
         "lists",
     ),
     *("mean", "mip", "none", "numba", "pixel", "ply", "progress", "psnr", "random", "soft", "ssim"),
-    *("full", "nerfstudio", "points", "published", "sum", "torch"),
+    *("full", "html", "nerfstudio", "points", "published", "sum", "torch"),
 }
 FILES = [path for path in sorted((ROOT / CORE).rglob("*.py")) if path.name != "defaults.py"]
 NAMES = {
