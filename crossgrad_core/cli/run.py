@@ -169,6 +169,7 @@ _LAST: Final = (
         "view",
         bool,
         "--view",
+        common=False,
         help="Show the run in a browser while it trains; the output names the address. Needs "
         "the extra view.",
     ),

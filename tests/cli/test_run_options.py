@@ -16,7 +16,7 @@ from crossgrad_core.run.settings import merged, parsed
 #: What is no setting: asked of one start of the command.
 OWN = {
     *("config", "assignments", "resume", "accept_scene", "accept_plugins", "prepare"),
-    *("dry_run", "check", "quiet", "verbose", "help_all"),
+    *("dry_run", "check", "quiet", "verbose", "view", "host", "port", "help_all"),
 }
 PARAMETERS = {each.name: each for each in get_command(app).commands["run"].params}
 
