@@ -12,6 +12,7 @@ from support.scenes import write_tiny_scene
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.run import app, load_run
+from crossgrad_core.run.export import ExportOptions
 from crossgrad_core.run.postprocess import evaluate, export, render
 from crossgrad_core.run.postprocess.open_options import How
 from crossgrad_core.run.results.lock import locked
@@ -59,7 +60,8 @@ def new_files(folder: Path, before: dict[str, bytes]) -> set[str]:
 
 
 def export_file(folder, **options):
-    export.export(folder, **{"file_format": "ply", "out": None, **options})
+    given = ExportOptions(camera=options.pop("camera", None))
+    export.export(folder, **{"file_format": "ply", "out": None, "options": given, **options})
 
 
 def test_baking_for_a_view_does_not_replace_the_file_of_the_summary(finished, capsys):
