@@ -130,7 +130,7 @@ def export(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
         UpAxis | None,
         typer.Option(
             help="Rotate the scene so that this axis points up; input keeps the axes. Default: y "
-            "for formats that require it (glb), else input.",
+            "or z for formats that define it, else input.",
         ),
     ] = None,
     sh_degree: Annotated[

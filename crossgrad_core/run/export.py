@@ -261,7 +261,7 @@ def _gaussians_of(
         raise UserError(
             f"the format cannot store Gaussians with the response {unbaked.response}",
             where="--unbaked",
-            expected="a format with a field for the response, such as ply or spz",
+            expected="a format with a field for the response",
             todo="leave --unbaked out, or choose another --format",
         )
     raise UserError(

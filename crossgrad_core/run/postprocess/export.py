@@ -6,7 +6,7 @@ from typing import Final
 from crossgrad_core.contract.georeference import INPUT, check_coordinates
 from crossgrad_core.contract.slots.exporter import Exporter
 from crossgrad_core.errors import UserError
-from crossgrad_core.registry.entries import build, find
+from crossgrad_core.registry.entries import build, entries, find
 from crossgrad_core.run.export import Exported, ExportOptions, described, export_scene, georef_of
 from crossgrad_core.run.postprocess.open_options import AS_IT_IS, Opens
 from crossgrad_core.run.postprocess.output_paths import own_name, writing
@@ -20,10 +20,8 @@ from crossgrad_core.system.files import clear_leftovers
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.wording import one_line
 
-#: Suffixes of Gaussian file formats. A file must not have the suffix of another format.
-_OF_FORMATS: Final = frozenset(
-    {".ply", ".splat", ".ksplat", ".spz", ".sog", ".rad", ".glb", ".html", ".usdz"}
-)
+#: Suffixes of Gaussian file formats of other programs.
+_OF_OTHERS: Final = frozenset({"ksplat", "rad", "sog", "splat"})
 
 
 def export(
@@ -130,7 +128,12 @@ def _writes_folder(file_format: str | None) -> bool:
 
 def _check_name(out: Path | None, exporter: Exporter) -> None:
     """Refuse an output file whose name ends like a file of another format."""
-    if out is None or out.suffix.lower() not in _OF_FORMATS - {f".{exporter.suffix}"}:
+    if out is None:
+        return
+    # A file must not have the suffix of another format.
+    suffix = out.suffix.lower().removeprefix(".")
+    known = {build(Exporter, name, {}).suffix for name in entries("exporters")} | _OF_OTHERS
+    if not suffix or suffix == exporter.suffix or suffix not in known:
         return
     raise UserError(
         "the name of the output file ends like a file of another format",

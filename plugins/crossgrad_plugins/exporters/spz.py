@@ -22,7 +22,7 @@ from crossgrad_plugins.exporters.spz_file import SpzTable, content_of, spz_degre
 
 
 class Spz(Exporter):
-    """SPZ of Niantic: about 20 bytes per Gaussian, y up; loses about 0.1 to 0.7 dB."""
+    """SPZ of Niantic: about 20 bytes per Gaussian, with a small loss; y up."""
 
     suffix: ClassVar[str] = "spz"
     up: ClassVar[str] = "y"

@@ -1,8 +1,9 @@
 """Gaussians drawn by the rules of programs that show them (`crossgrad eval --file FILE --as NAME`).
 
 Each function returns [H, W, 3] RGB on black. The rules are those of the default settings of the
-programs, read in their public sources: PlayCanvas engine, GaussianSplats3D of mkkellogg, Spark,
-CesiumJS. Where nothing else is stated, the rules of crossgrad apply (docs/rasterizers.md).
+programs. The rules of GaussianSplats3D (mkkellogg), Spark and CesiumJS were read in their public
+sources. The rule of the PlayCanvas engine was taken from a description. If no other rule is stated,
+the rules of crossgrad apply (docs/rasterizers.md).
 """
 
 from collections.abc import Callable
