@@ -67,6 +67,7 @@ if TYPE_CHECKING:
     from crossgrad_core.config import ComponentChoice, RunConfig
     from crossgrad_core.contract.scene import Scene
     from crossgrad_core.gradients.separate import DenseGradients as gathered  # noqa: N813
+    from crossgrad_core.registry.file_formats import exporter_for
     from crossgrad_core.run.assemble import accepts, assemble
     from crossgrad_core.run.decisions import DEFAULT_STEPS, facts_of, table_of
     from crossgrad_core.run.load_run import opened as open_run
@@ -138,6 +139,7 @@ __all__ = [
     "error_map",
     "evaluated_model",
     "exit_code",
+    "exporter_for",
     "facts_of",
     "find_runs",
     "fingerprint",
@@ -214,6 +216,7 @@ _LATE: Final = {
     "error_map": "run.results.panels",
     "choose_rasterizer": "run.rasterizers",
     "evaluated_model": "training.step",
+    "exporter_for": "registry.file_formats",
     "facts_of": "run.decisions",
     "find_runs": "run.results.reading",
     "gathered": "gradients.separate:DenseGradients",

@@ -30,6 +30,7 @@ from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.registry.slots import GROUPS, LISTS, MANY
 from crossgrad_core.run.decisions import DEFAULT_STEPS, with_decisions
 from crossgrad_core.run.devices import choose_device, with_device
+from crossgrad_core.run.export import check_frame
 from crossgrad_core.run.select import select
 from crossgrad_core.scene.self_check.check import checked
 from crossgrad_core.training.modes import mode_note
@@ -235,7 +236,9 @@ def _with_first_degree(config: RunConfig) -> RunConfig:
     path = config.data.init_file
     if config.sh_from is not None or path is None:
         return config
-    degree = exporter_for(path, "--init").sh_degree_of(path)
+    exporter = exporter_for(path, "--init")
+    check_frame(path)
+    degree = exporter.sh_degree_of(path)
     return config.model_copy(update={"sh_from": degree})
 
 

@@ -21,6 +21,7 @@ from crossgrad_core.evaluation.evaluation import compare, psnr
 from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.run.export_edits import Crop, camera_in, most_important, upright, with_degree
 from crossgrad_core.system.files import write_atomically
+from crossgrad_core.system.text_files import read_json
 from crossgrad_core.training.per_image_params import apply
 from crossgrad_core.training.rules import eval_parameters
 from crossgrad_core.training.setup import Setup
@@ -292,6 +293,31 @@ def coordinates_of(setup: Setup, exporter: Exporter, options: ExportOptions) -> 
 def georef_of(path: Path) -> Path:
     """Return the path of the file that tells other programs the location of an exported file."""
     return path.with_name(f"{path.name}.georef.json")
+
+
+def check_frame(path: Path) -> None:
+    """Refuse a file of Gaussians whose `.georef.json` names other axes than those of the input.
+
+    Some formats have no field for their coordinates, so the file itself cannot be checked.
+
+    Raises:
+        UserError: The coordinates or the up axis of the file differ from the scene's input.
+    """
+    try:
+        facts = read_json(georef_of(path))
+    except (OSError, ValueError):
+        return
+    if not isinstance(facts, dict):
+        return
+    coordinates, up = facts.get("coordinates", INPUT), facts.get("up", INPUT)
+    if coordinates != INPUT or up != INPUT:
+        raise UserError(
+            "the file uses other coordinates than the scene",
+            where=path,
+            expected="the coordinates of the scene's input files",
+            found=f"coordinates {coordinates}, up {up}, as {georef_of(path).name} states",
+            todo="export the file again with --coordinates input --up input",
+        )
 
 
 def _write_georef(path: Path, placed: Placed, exporter: Exporter) -> tuple[str, ...]:

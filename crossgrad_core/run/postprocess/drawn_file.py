@@ -12,7 +12,7 @@ from crossgrad_core.contract.scene import Camera, View
 from crossgrad_core.registry.entries import find, resolve_entry
 from crossgrad_core.registry.file_formats import exporter_for
 from crossgrad_core.registry.slots import VIEWERS
-from crossgrad_core.run.export import plain_drawer
+from crossgrad_core.run.export import check_frame, plain_drawer
 from crossgrad_core.system.checksums import warn_if_changed
 from crossgrad_core.training.per_image_params import apply
 from crossgrad_core.training.setup import Setup
@@ -46,6 +46,7 @@ class DrawnFile:
             UserError: The file cannot be read, or its name shows no format of Gaussians.
         """
         exporter = exporter_for(self.path, "--file")
+        check_frame(self.path)
         warn_if_changed(self.path)
         return exporter.read(self.path, setup.scene.similarity)
 

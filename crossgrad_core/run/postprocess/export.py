@@ -21,7 +21,7 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.wording import one_line
 
 #: Suffixes of Gaussian file formats of other programs.
-_OF_OTHERS: Final = frozenset({"ksplat", "rad", "sog", "splat"})
+_OF_OTHERS: Final = frozenset({"ksplat", "rad"})
 
 
 def export(

@@ -25,7 +25,6 @@ class Spz(Exporter):
     """SPZ of Niantic: about 20 bytes per Gaussian, with a small loss; y up."""
 
     suffix: ClassVar[str] = "spz"
-    up: ClassVar[str] = "y"
     lossy: ClassVar[bool] = True
     responses: ClassVar[frozenset[Response]] = frozenset({"plain", "antialiased"})
 

@@ -14,12 +14,12 @@ from crossgrad_core.commands import (
     choose_rasterizer,
     configured,
     evaluated_model,
+    exporter_for,
     merged,
     open_run,
     read_scene,
 )
 from crossgrad_core.plugin import (
-    Exporter,
     Rasterizer,
     Scene,
     Similarity,
@@ -50,7 +50,7 @@ class How:
 
 
 def stage_of(paths: Sequence[Path], how: How) -> Stage:
-    """Return what the viewer shows for one or two runs, PLY files or scenes.
+    """Return what the viewer shows for one or two runs, files of Gaussians or scenes.
 
     Raises:
         UserError: A path is nothing of these, or cannot be read.
@@ -71,13 +71,13 @@ def _opened(path: Path, how: How) -> tuple[Source, Scene | None]:
         setup, state = open_run(path, machine, accept_scene=how.accept_scene)
         title = f"{path}, step {state.step:,}, {state.primitives(setup):,} primitives"
         return Source.of_model(title, evaluated_model(setup, state)), setup.scene
-    if path.suffix.lower() == ".ply":
+    if path.is_file():
         return _of_file(path, how), None
     if not path.is_dir():
         raise UserError(
             "there is nothing to view",
             where=path,
-            expected="the folder of a run, a PLY file of Gaussians, or the folder of a scene",
+            expected="the folder of a run, a file of Gaussians, or the folder of a scene",
             todo="check the path",
         )
     settings = {"scene": str(path), "threads": how.threads}
@@ -87,9 +87,9 @@ def _opened(path: Path, how: How) -> tuple[Source, Scene | None]:
 
 
 def _of_file(path: Path, how: How) -> Source:
-    """Return the Gaussians of a PLY file, in a frame of about unit size."""
+    """Return the Gaussians of a file, in a frame of about unit size."""
     device = how.device or "cpu"
-    exporter = build_component(Exporter, "ply", {})
+    exporter = exporter_for(path)
     positions: NDArray[np.float64] = (
         exporter.read(path, Similarity(np.zeros(3), 1.0)).means.double().numpy()
     )
@@ -115,7 +115,7 @@ def warm_up(stage: Stage) -> None:
 def open_viewer(
     *paths: Path | str, host: str = "127.0.0.1", port: int = 8080, how: How | None = None
 ) -> Viewer:
-    """Open one or two runs, PLY files or scenes in a viewer that draws in its own thread.
+    """Open one or two runs, files of Gaussians or scenes in a viewer that draws in its own thread.
 
     A notebook shows the returned viewer inline.
 

@@ -11,10 +11,10 @@ class Given:
     """The options of the command."""
 
     path: Path = argument(
-        "RUN|PLY|SCENE", "Folder of a run, PLY file of Gaussians, or folder of a scene."
+        "RUN|FILE|SCENE", "Folder of a run, file of Gaussians, or folder of a scene."
     )
     other: Path | None = argument(
-        "RUN|PLY", "A second run or file to compare with the first.", default=None
+        "RUN|FILE", "A second run or file to compare with the first.", default=None
     )
     host: str = option(
         "127.0.0.1",
@@ -38,7 +38,7 @@ class Given:
 
 @command_of(Given)
 def view(given: Given) -> None:
-    """Show a run, a PLY file or a scene in a browser, drawn by the run's own rasterizer.
+    """Show a run, a file of Gaussians or a scene in a browser, drawn by the run's own rasterizer.
 
     Ctrl-C ends the viewer. With two runs, a split line compares their renders. The photos of the
     scene, the error and the depth are further layers.
