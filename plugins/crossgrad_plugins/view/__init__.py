@@ -1,1 +1,1 @@
-"""The viewer: runs, files of Gaussians and scenes in a browser, drawn by the rasterizer of the run."""
+"""The viewer shows runs, files of Gaussians and scenes in a browser."""
