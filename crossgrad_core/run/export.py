@@ -147,8 +147,7 @@ def export_scene(
     notes = exporter.write(ready.content, path)
     notes += (*ready.placed.notes, *_write_georef(path, ready.placed, exporter))
     background = _own_background(setup)
-    exact = setup.backbone.plain or not ready.baked
-    if exact and background is None and not exporter.lossy and not options.reduces:
+    if setup.backbone.plain and background is None and not exporter.lossy and not options.reduces:
         return Exported(number, notes=notes)
     compared = scene.test_views if options.camera is None else ready.views
     drawn = drawer(setup, state, exporter.stored(ready.gaussians, scene.similarity))

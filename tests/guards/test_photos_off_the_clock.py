@@ -8,6 +8,9 @@ import pytest
 ROOT = Path(__file__).parents[2]
 #: What decodes on whatever clock is running.
 DECODES = re.compile(r"\.photo\.(image|mask)\(")
+#: Code that decodes outside training: trackers during an evaluation, and the viewer for its frames,
+#: whose seconds have a limit of their own.
+ALLOWED = {"tracker.py", "frames.py"}
 PLUGIN_PACKAGES = ("backbones", "operators", "plugins")
 
 
@@ -15,7 +18,8 @@ PLUGIN_PACKAGES = ("backbones", "operators", "plugins")
 def test_no_plugin_decodes_photos_itself(folder):
     sources = sorted((ROOT / folder).rglob("*.py"))
     assert sources
-    assert not [path.name for path in sources if DECODES.search(path.read_text(encoding="utf-8"))]
+    found = {path.name for path in sources if DECODES.search(path.read_text(encoding="utf-8"))}
+    assert found <= ALLOWED
 
 
 def test_the_pattern_finds_code_that_decodes_photos():

@@ -37,7 +37,7 @@ def test_a_run_writes_a_page_of_its_scene_and_its_training_cameras(scene, tmp_pa
     assert run(scene, out) == 0
     assert "point_cloud.html" in summary(out)["exports"]
     shown = facts(out / "point_cloud.html")
-    assert shown["gaussians"] == summary(out)["ply"]["gaussians"]
+    assert shown["gaussians"] == summary(out)["exports"]["point_cloud.ply"]["gaussians"]
     assert f"crossgrad step {STEPS}" in shown["comments"]
     assert len(shown["cameras"]) == 4
     assert "point_cloud.html" in (out / "SHA256SUMS").read_text()
@@ -57,8 +57,8 @@ def test_a_large_scene_gets_no_page_and_loses_an_old_one(scene, tmp_path, monkey
 def test_a_run_that_exports_a_page_anyway_writes_one_page(scene, tmp_path):
     out = tmp_path / "run"
     assert run(scene, out, exporter={"name": "html"}) == 0
-    assert "point_cloud.html" not in summary(out)["exports"]
-    assert summary(out)["ply"]["loss"] is not None
+    assert [*summary(out)["exports"]] == ["point_cloud.html"]
+    assert summary(out)["exports"]["point_cloud.html"]["loss"] is not None
     assert [path.name for path in out.glob("point_cloud*")] == ["point_cloud.html"]
 
 

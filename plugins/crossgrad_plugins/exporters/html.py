@@ -38,6 +38,8 @@ _LARGEST_HALF = float(np.finfo(np.float16).max)
 _TEXEL, _FULL = 16, 3
 #: Bytes of a Gaussian of degree 3 in the page: 84 bytes in base 64, without compression.
 LARGEST_BYTES: Final = 112
+#: Bytes for the facts about the scene and the headers of the compressed data, without cameras.
+_LARGEST_FACTS: Final = 4096
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +131,7 @@ class Html(Exporter):
 
     @override
     def largest_size(self, gaussians: int) -> int:
-        return len(_template()) + gaussians * LARGEST_BYTES
+        return len(_template()) + _LARGEST_FACTS + gaussians * LARGEST_BYTES
 
     @override
     def write(self, content: ExportContent, path: Path) -> tuple[str, ...]:

@@ -80,7 +80,7 @@ class Options:
 
 @command_of(Options)
 def sweep(given: Options) -> None:
-    """Run a grid of configurations, scenes and seeds, or resume such a grid.
+    """Run or resume a grid of configurations, scenes and seeds.
 
     Every run is executed by `crossgrad run` in a separate folder. The folder is named by a hash of
     configuration, scene and seed, so that a finished run is never repeated.

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from crossgrad_core.numerics.rotations import matrix_rows
 from crossgrad_core.plugin import Camera, Similarity, View, centers_of
 
 _Floats = NDArray[np.float64]
@@ -52,14 +53,7 @@ def camera_of(window: Window) -> Camera | None:
 
 def rotation_of(wxyz: _Floats) -> _Floats:
     """Return the [3, 3] rotation of a unit quaternion."""
-    w, x, y, z = wxyz
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return np.array(matrix_rows(*wxyz.tolist()))
 
 
 def quaternion_of(camera: Camera) -> _Floats:

@@ -38,7 +38,7 @@ class Given:
 
 @command_of(Given)
 def view(given: Given) -> None:
-    """Show a run, a file of Gaussians or a scene in a browser, drawn by the run's own rasterizer.
+    """Show a run, a file of Gaussians or a scene in a browser.
 
     Ctrl-C ends the viewer. With two runs, a split line compares their renders. The photos of the
     scene, the error and the depth are further layers.
