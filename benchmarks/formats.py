@@ -34,6 +34,9 @@ FORMATS = (
     ("glb", {}),
     ("tiles", {}),
     ("usd", {}),
+    ("sog", {}),
+    ("html", {}),
+    ("splat", {}),
 )
 
 

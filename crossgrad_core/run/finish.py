@@ -291,9 +291,9 @@ def overdone(rows: Sequence[Row]) -> list[str]:
 
 
 def next_lines(folder: Path) -> list[str]:
-    """Return the commands that render and export the results of a finished run, and its page."""
+    """Return the commands that show and export the results of a finished run, and its page."""
     run = one_line(quote(str(folder)))
-    lines = [f"next: crossgrad render {run} (images), crossgrad export {run} (a file for viewers)"]
+    lines = [f"next: crossgrad view {run} (in a browser), crossgrad export {run} (more formats)"]
     if (folder / PAGE).is_file():
         lines.append(f"open the scene in a browser: {one_line(folder / PAGE)}")
     return lines
