@@ -80,6 +80,7 @@ def test_a_frame_equals_the_render_of_an_evaluation(viewer, trained):
         expected = rounded(run.render(view.name))
         with window(viewer.url) as page:
             page.open(view.camera, FOV)
+            page.still()
             found = inner(shown(page, view), expected)
         np.testing.assert_array_equal(found, expected)
 
@@ -92,6 +93,7 @@ def test_a_recorded_path_is_rendered_with_the_frames_of_the_viewer(
     frames = []
     with window(viewer.url) as page:
         page.open(scene.train_views[0].camera, FOV)
+        page.still()
         for view in scene.train_views[:2]:
             # A field of view of its own makes the window a free camera of the same pose.
             far = replace(view.camera, world_to_camera=view.camera.world_to_camera.clone())
@@ -124,6 +126,7 @@ def test_numbers_that_are_no_camera_are_ignored(viewer, trained):
     camera = cg.open(trained).scene.train_views[0].camera
     with window(viewer.url) as page:
         page.open(camera, FOV)
+        page.still()
         for fov, size in ((float("nan"), (96, 64)), (FOV, (0, 64)), (FOV, (96, 10**6))):
             page.look(camera, fov, size=size)
         page.look(camera, FOV + 0.1)
@@ -143,6 +146,7 @@ def test_a_run_in_training_is_shown_paused_and_stopped(scene, tmp_path):
         with window(url) as page:
             frames.append(page.open(camera, FOV))
             page.press("Pause")
+            page.still()
             frames.append(shown(page, view))
             page.press("Stop")
             with suppress(ConnectionClosed):  # The viewer ends with the run.

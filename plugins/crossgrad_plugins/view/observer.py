@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 _LOG = logging.getLogger(__name__)
 #: Largest drawing time that is saved up while no frame is due, in seconds, and longest wait of a
 #: paused run before it looks for requests.
-_SAVED, _WAIT = 1.0, 0.1
+_SAVED, _WAIT = 0.2, 0.1
 
 
 def _no_model(_camera: Camera, _outputs: frozenset[str]) -> Render:
