@@ -8,9 +8,9 @@ from pathlib import Path
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import evaluate as measured
 from crossgrad_core.evaluation.result import EvaluationResult, ViewMetrics
-from crossgrad_core.run.cross_capture import Elsewhere, elsewhere
 from crossgrad_core.run.export import plain_renderer, renderer
 from crossgrad_core.run.load_run import require_checkpoint
+from crossgrad_core.run.postprocess.cross_capture import Elsewhere, elsewhere
 from crossgrad_core.run.postprocess.drawn_file import DrawnFile
 from crossgrad_core.run.postprocess.open_options import AS_IT_IS, Opens
 from crossgrad_core.run.postprocess.output_paths import is_changed, own_name, writing_if_possible

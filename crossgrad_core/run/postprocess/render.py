@@ -12,9 +12,9 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import evaluate as measured
 from crossgrad_core.run.camera_path import FRAMES, ZOOM, camera_path
 from crossgrad_core.run.checkpoint import CHECKPOINTS, load, named_checkpoints
-from crossgrad_core.run.cross_capture import elsewhere
 from crossgrad_core.run.export import camera_renderer, plain_renderer, renderer
 from crossgrad_core.run.load_run import from_checkpoint
+from crossgrad_core.run.postprocess.cross_capture import elsewhere
 from crossgrad_core.run.postprocess.drawn_file import DrawnFile
 from crossgrad_core.run.postprocess.open_options import AS_IT_IS, Opens
 from crossgrad_core.run.postprocess.output_paths import is_changed, writing

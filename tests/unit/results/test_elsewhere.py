@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.run.cross_capture import (
+from crossgrad_core.run.postprocess.cross_capture import (
     SAME_DIRECTION,
     SAME_PLACE,
     _are_trained,
