@@ -179,7 +179,12 @@ class Session:
                 draw_curve(self.folder, rows, title(setup), counts)
 
     def export(self, setup: Setup, state: TrainState) -> None:
-        """Write the trained scene and log a description of the file."""
+        """Write the trained scene and log a description of the file.
+
+        A model that lost all its primitives has no file; the run reports the loss.
+        """
+        if state.primitives(setup) == 0:
+            return
         path = self.folder / cloud_name(setup.selection.exporter)
         with reporting(state):
             if path.is_dir():

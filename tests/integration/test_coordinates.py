@@ -16,6 +16,7 @@ from crossgrad_core.run import app
 from crossgrad_core.run.assemble import assemble, read_scene
 from crossgrad_core.run.export import ExportOptions, export_scene
 from crossgrad_core.run.postprocess import evaluate, export
+from crossgrad_core.run.postprocess.drawn_file import DrawnFile
 from crossgrad_core.run.postprocess.open_options import AS_IT_IS
 from crossgrad_core.training.start import first_state
 from crossgrad_plugins.exporters.ply_file import read_ply
@@ -161,7 +162,8 @@ def test_a_scene_without_georeference_or_offset_writes_no_georef_file(tmp_path):
 
 def test_export_writes_next_to_the_files_of_the_run_and_overwrites_none(trained, capsys):
     before = {path.name: path.read_bytes() for path in trained.iterdir() if path.is_file()}
-    before.pop("SHA256SUMS", None)  # It follows each file that is added.
+    for name in ("SHA256SUMS", "summary.json"):  # They list each file that is added.
+        before.pop(name, None)
     assert ended("export", trained, "--coordinates", "utm") == 0
     told = capsys.readouterr().out
     assert "utm coordinates, see point_cloud_utm.ply.georef.json" in told
@@ -185,7 +187,7 @@ def test_evaluating_a_ply_in_other_coordinates_is_refused(trained, tmp_path):
     path = tmp_path / "a.ply"
     export.exported(trained, out=path, options=ExportOptions(coordinates="enu"))
     with pytest.raises(UserError, match=r"uses other coordinates(?s:.*)--coordinates input"):
-        evaluate.evaluated_file(trained, path)
+        evaluate.evaluated_file(trained, DrawnFile(path))
 
 
 def test_options_of_the_reader_are_used_again_when_a_run_is_opened(scene, tmp_path):

@@ -11,6 +11,7 @@ from crossgrad_core.system import ply_table
 from crossgrad_fuzz.case import Case
 from crossgrad_fuzz.mutate import COUNTS, NUMBERS, matcher
 from crossgrad_fuzz.target import Target
+from crossgrad_plugins.exporters import file_units as units
 from crossgrad_plugins.exporters import ply_file as ply
 from crossgrad_plugins.exporters.ply_cloud import SplatCloud
 from crossgrad_plugins.exporters.ply_file import (
@@ -101,7 +102,8 @@ TARGET = Target(
     seeds=_seeds,
     parse=_parse,
     parser={
-        ply: ("write_ply", "position_offset", "_header", "_representable", "_rows", "_plain"),
+        ply: ("write_ply", "_header", "_rows"),
+        units: ("position_offset", "representable", "plain_number"),
         ply_table: (),
     },
     words=(
