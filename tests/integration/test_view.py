@@ -70,8 +70,7 @@ def inner(frame, like):
 def shown(page, view):
     """The lossless frame after the page's camera went to a view."""
     page.set("Go to", view.name)
-    page.look(view.camera, fov_of(view.camera))
-    return page.still()
+    return page.moved(view.camera, fov_of(view.camera))
 
 
 def test_a_frame_equals_the_render_of_an_evaluation(viewer, trained):
@@ -94,13 +93,13 @@ def test_a_recorded_path_is_rendered_with_the_frames_of_the_viewer(
     with window(viewer.url) as page:
         page.open(scene.train_views[0].camera, FOV)
         page.still()
-        for view in scene.train_views[:2]:
+        for count, view in enumerate(scene.train_views[:2], start=1):
             # A field of view of its own makes the window a free camera of the same pose.
             far = replace(view.camera, world_to_camera=view.camera.world_to_camera.clone())
             far.world_to_camera[2, 3] += 0.2
-            page.look(far, FOV)
-            frames.append(page.still())
+            frames.append(page.moved(far, FOV))
             page.press("Add keyframe")
+            page.until(lambda count=count: page.says(f"{count} keyframes"))
         page.press("Save the path")
         page.until((tmp_path / "camera_path.json").exists)
     assert len(json.loads((tmp_path / "camera_path.json").read_text())["camera_path"]) == 49

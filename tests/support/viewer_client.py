@@ -22,6 +22,7 @@ class Window:
         self.frames = []
         self.gui = {}
         self.files = {}
+        self.texts = []
 
     def _send(self, kind, **fields):
         self._socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
@@ -70,6 +71,8 @@ class Window:
             self.frames.append((message["format"], np.asarray(image)))
         elif message["type"] == "FileTransferPart":
             self.files[message["transfer_uuid"]] = message["content"]
+        elif message["type"] == "GuiUpdateMessage":
+            self.texts.append(str(message["updates"]))
         label = (message.get("props") or {}).get("label")
         if message["type"].startswith("Gui") and label is not None:
             self.gui[label] = message["uuid"]
@@ -86,6 +89,22 @@ class Window:
         """Return the next frame without loss."""
         self.frames.clear()
         return self.until(lambda: [image for kind, image in self.frames if kind == "png"])[-1]
+
+    def moved(self, camera, fov):
+        """Move the camera, and return the first frame without loss after the movement's frames."""
+        self.frames.clear()
+        self.look(camera, fov)
+
+        def found():
+            kinds = [kind for kind, _ in self.frames]
+            after = kinds.index("jpeg") if "jpeg" in kinds else len(kinds)
+            return [image for kind, image in self.frames[after:] if kind == "png"]
+
+        return self.until(found)[-1]
+
+    def says(self, text):
+        """Return True if a control of the page has shown this text."""
+        return any(text in shown for shown in self.texts)
 
     def frame(self):
         """Return the next frame of any kind."""
