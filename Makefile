@@ -17,7 +17,7 @@ BASE ?= HEAD~1
 # What `make paper` hands on, such as PAPER="--scenes DIR --workers 1".
 PAPER ?=
 
-.PHONY: demo install test bits slow browser matrix exposures compat faults fuzz lint bench paper clean
+.PHONY: demo install test bits slow browser matrix exposures compat faults fuzz lint bench paper docs clean
 
 demo: install  ## Train the bundled real scene for two minutes at most and print the results
 	$(BIN)/crossgrad run
@@ -60,6 +60,10 @@ fuzz: install  ## Ten minutes of mutated files for each parser; findings go to f
 	PYTHONPATH=tests:tests/fuzz $(BIN)/python -m crossgrad_fuzz defects
 	PYTHONPATH=tests:tests/fuzz $(BIN)/python -m crossgrad_fuzz run --seconds $(FUZZ_SECONDS) \
 	    --executions $(FUZZ_EXECUTIONS) --seed $(FUZZ_SEED) --least 0.95
+
+docs: install  ## The site: build/docs/index.html
+	$(BIN)/pip install $(PIP_FLAGS) --editable ".[docs]"
+	$(BIN)/sphinx-build -W -n -q -b html docs build/docs
 
 lint: install  ## ruff and mypy
 	$(BIN)/pip install $(PIP_FLAGS) --editable ".[lint]"
