@@ -291,7 +291,7 @@ def test_an_error_reported_from_the_background_ends_training_after_the_step():
 def test_the_tests_cover_every_hook_of_a_step():
     outside = {
         *("validate_selection", "run_start", "update_intervals", "eval_parameters", "final_edit"),
-        *("evaluation", "length_changed", "log", "run_end"),
+        *("evaluation", "length_changed", "between_steps", "log", "run_end"),
     }
     hooks = {name for name in vars(HookSpecs) if name.startswith("crossgrad_")}
     assert hooks == {f"crossgrad_{name}" for name in (*outside, *(hook for hook, *_ in HOOKS))}
