@@ -393,7 +393,7 @@ def camera_renderer(setup: Setup, state: TrainState) -> Callable[[Camera], Tenso
 
 
 def drawer(setup: Setup, state: TrainState, gaussians: Gaussians) -> Callable[[View], Tensor]:
-    """Return a function that renders the same Gaussians for every view, exposure included.
+    """Return a function that renders `gaussians` for a view and applies the exposure of the view.
 
     The background is black, because viewers draw the Gaussians of a file on black.
     """
@@ -402,7 +402,7 @@ def drawer(setup: Setup, state: TrainState, gaussians: Gaussians) -> Callable[[V
 
 
 def plain_drawer(setup: Setup, gaussians: Gaussians) -> Callable[[View], Tensor]:
-    """Return a function that renders the same Gaussians on black, before any exposure."""
+    """Return a function that renders `gaussians` for a view on black, without exposure."""
     background = torch.zeros(3, device=setup.device)
     moved = gaussians.mapped(lambda tensor: tensor.to(setup.device))
     return lambda view: setup.rasterizer.render(moved, view.camera, background).image

@@ -81,7 +81,7 @@ def make_frame(centers: NDArray[np.float64], points: NDArray[np.float64]) -> Fra
     """
     stray = stray_rows(centers, points)
     centers = centers[~stray]
-    # Average differences of coordinates, because a sum of coordinates far from 0 loses digits.
+    # Sum the offsets from the first centre, because a sum of large coordinates loses digits.
     origin = centers[0] + (centers - centers[0]).mean(0)
     extent = float(_MARGIN * np.linalg.norm(centers - origin, axis=1).max())
     depth = float(np.median(np.linalg.norm(points - origin, axis=1))) if len(points) else 0.0

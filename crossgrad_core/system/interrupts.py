@@ -87,7 +87,12 @@ def resume_hint(text: str) -> Iterator[None]:
 
 @contextmanager
 def ended_quietly() -> Iterator[None]:
-    """End the process at once on a signal inside the block, and silently after the block."""
+    """Let a signal end the process at once.
+
+    If the signal arrives inside the block, `end_at_once` handles it. If the signal arrives after
+    the block, the process ends without a message. Signals that were ignored before the block are
+    still ignored.
+    """
     numbers = signal_names()
     for number in numbers:
         signal.signal(number, end_at_once)

@@ -127,10 +127,11 @@ def otsu_threshold(values: NDArray[np.float64]) -> float:
 
 
 def otsu_separability(samples: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return [...] the share of the variance that is between two sides of values [..., N >= 2].
+    """Return [...] the share of the variance that is between the two classes of Otsu's threshold.
 
-    Otsu's threshold separates the two sides. The share is 1 for two different values, and about 3/4
-    for many evenly spread values. The share is 0 if all values are equal.
+    The variance is computed over the last axis of `samples` [..., N >= 2]. The share is 1 for two
+    different values, and about 3/4 for many evenly spread values. The share is 0 if all values are
+    equal.
 
     Source: Otsu 1979 (eta, equation 14).
     """

@@ -231,7 +231,7 @@ def _step_row(
     """
     at, begin, g = row * width, grad_row * width, splat_wide(_ZERO)
     # The row is processed in groups of sixteen elements. The last group may overlap with the group
-    # before. Compute the last group first, because its input must not have been updated already.
+    # before. Compute the last group first, because the group before overwrites the shared elements.
     tail = at + width - WIDE
     if drawn:
         g = load_wide(grad, begin + width - WIDE)
