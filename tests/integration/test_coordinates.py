@@ -66,9 +66,7 @@ def moved(matrix, points):
 
 
 @pytest.mark.parametrize("coordinates", COORDINATES)
-def test_an_exported_file_is_georeferenced_and_its_matrices_invert_the_export(
-    scene, tmp_path, coordinates
-):
+def test_the_georef_file_maps_an_exported_file_back_to_the_input(scene, tmp_path, coordinates):
     setup, state = started(scene)
     path = tmp_path / "a.ply"
     exported = export_scene(setup, state, path, options=ExportOptions(coordinates=coordinates))

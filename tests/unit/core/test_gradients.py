@@ -345,7 +345,7 @@ def test_operators_accept_every_granularity(name, granularity):
 @pytest.mark.parametrize("absent", [0, 1, 2])
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 7])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
-def test_the_mean_is_the_sum_divided_by_all_views_to_the_bit(count, dtype, absent):
+def test_the_mean_has_the_bits_of_the_sum_divided_by_the_number_of_views(count, dtype, absent):
     """The sum is divided once. Views without a gradient count in the divisor."""
     views = make_views(count, dtype)
     views[min(absent, count - 1)]["means"] = None

@@ -81,7 +81,7 @@ def test_coverage_of_the_hard_cases_is_within_the_accepted_range(
 
 
 @pytest.mark.parametrize("isotropic", [True, False])
-def test_the_variance_assumed_at_the_true_gap_agrees_with_normal_theory(isotropic):
+def test_the_variance_that_the_interval_assumes_agrees_with_normal_theory(isotropic):
     """Compare the mean variance that the pivot assumes at the true gap with normal theory."""
     rng = np.random.default_rng(1)
     scales = np.ones(30) if isotropic else 1.0 / np.sqrt(1.0 + np.arange(30))

@@ -264,7 +264,7 @@ def test_the_analytic_gradient_agrees_with_autograd(name, masked):
 
 @pytest.mark.parametrize("ssim_weight", [0.0, 1.0])
 @pytest.mark.parametrize("kept", [None, "none", "one"])
-def test_the_analytic_gradient_is_correct_at_the_ends_of_its_options(ssim_weight, kept):
+def test_the_analytic_gradient_is_correct_for_extreme_weights_and_masks(ssim_weight, kept):
     """Masked pixels may have any value."""
     image, target = BLURRED.double(), NATURAL.double()
     mask = None if kept is None else torch.zeros(image.shape[:2], dtype=torch.bool)

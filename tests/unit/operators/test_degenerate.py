@@ -94,7 +94,7 @@ def test_nearly_parallel_pairs_are_exact_at_every_distance(name, sign, dtype):
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.__name__)
 @pytest.mark.parametrize("name", ["nash", "imtl-g", "aligned", "gradvac", "soft"])
 @pytest.mark.parametrize("dtype", TYPES)
-def test_results_for_random_gradients_agree_with_fifty_digits(name, family, dtype):
+def test_results_for_random_gradients_agree_with_a_computation_in_50_digits(name, family, dtype):
     rng = np.random.default_rng(5)
     for _ in range(3):
         assert judged(name, family(rng)[:6], dtype) <= 8

@@ -265,7 +265,7 @@ def test_views_per_step_are_not_decided_if_the_user_chose_sampler_or_operator(na
     assert grouping.views_per_step(evidence).basis == "default"
 
 
-def test_pairs_from_modes_of_unequal_size_are_rejected_because_they_change_the_objective():
+def test_pairs_of_near_and_far_views_are_rejected_if_one_group_is_much_smaller():
     found = grouping.pairs(evidence_of("ochota_kap_hybrid", PAIRS_PAY))
     assert (found.basis, dict(found.settings)) == ("default", {})
     assert "the smaller mode has 34% of the views" in found.evidence

@@ -416,7 +416,7 @@ def test_a_state_with_new_names_is_checked_again():
         take_step(setup, state)
 
 
-def test_rows_marked_as_fresh_lose_moments_and_statistics_even_without_new_rows():
+def test_an_edit_of_fresh_rows_resets_their_moments_and_statistics():
     fresh = torch.arange(40) < 3
     held = PluginState(per_primitive={"seen": torch.ones(40)})
     plugin = Answers(DensifyResult(NO_EDIT, states={"stranger": held}))
