@@ -10,7 +10,7 @@ from support.scenes import write_tiny_scene
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.run import app
-from crossgrad_core.run import cross_capture as elsewhere_module
+from crossgrad_core.run.postprocess import cross_capture as elsewhere_module
 from crossgrad_core.run.postprocess import evaluate, render
 from crossgrad_core.run.postprocess.cross_capture import _alike
 from crossgrad_core.run.postprocess.drawn_file import DrawnFile
