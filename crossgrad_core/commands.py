@@ -70,6 +70,7 @@ if TYPE_CHECKING:
     from crossgrad_core.registry.file_formats import exporter_for
     from crossgrad_core.run.assemble import accepts, assemble
     from crossgrad_core.run.decisions import DEFAULT_STEPS, facts_of, table_of
+    from crossgrad_core.run.export import check_frame
     from crossgrad_core.run.load_run import opened as open_run
     from crossgrad_core.run.rasterizers import Wanted as RasterizerDemands
     from crossgrad_core.run.rasterizers import choose_rasterizer
@@ -122,6 +123,7 @@ __all__ = [
     "changed_files",
     "check_file",
     "check_folder",
+    "check_frame",
     "check_new",
     "check_unchanged",
     "choose_rasterizer",
@@ -215,6 +217,7 @@ _LATE: Final = {
     "begin": "training.start:first_state",
     "error_map": "run.results.panels",
     "choose_rasterizer": "run.rasterizers",
+    "check_frame": "run.export",
     "evaluated_model": "training.step",
     "exporter_for": "registry.file_formats",
     "facts_of": "run.decisions",

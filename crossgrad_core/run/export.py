@@ -60,7 +60,7 @@ class Exported:
 
     @property
     def loss(self) -> float | None:
-        """The loss of PSNR in dB by baking and by the background, which no file stores."""
+        """The loss of PSNR in dB by the file: its precision, its options, baking and background."""
         if self.psnr is None or self.live_psnr is None:
             return None
         return self.live_psnr - self.psnr
@@ -80,7 +80,8 @@ class ExportOptions:
             over the training views.
         coordinates: Coordinates of the file, as `check_coordinates` accepts them; None for those
             of the exporter.
-        up: The axis of the file that points up, from `UP_AXES`; None for that of the exporter.
+        up: The axis of the file that points up, `y`, `z` or `input`; None for that of the
+            exporter.
         sh_degree: Highest degree of spherical harmonics in the file; None for all.
         crop: The part of space to export; None for all.
         max_gaussians: Number of Gaussians to keep, those that contribute most to the training

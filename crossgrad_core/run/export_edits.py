@@ -18,8 +18,6 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.system.text_files import read_rows
 from crossgrad_core.training.setup import Setup
 
-#: Axes that can point up in a file.
-UP_AXES: Final = ("y", "z", INPUT)
 #: Number of values of a box: its smallest and its largest x, y and z.
 _BOX: Final = 6
 _FEWEST_CORNERS: Final = 3
@@ -111,7 +109,7 @@ def upright(placed: Placed, up: NDArray[np.float64], axis: str, coordinates: str
     Args:
         placed: Gaussians in the coordinates of the file.
         up: [3] unit vector that points up, local frame.
-        axis: One of `UP_AXES`; `input` changes nothing.
+        axis: `y`, `z`, or `input`, which changes nothing.
         coordinates: The coordinates of the file.
 
     Raises:

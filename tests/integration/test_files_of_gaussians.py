@@ -84,7 +84,7 @@ def test_render_draws_the_gaussians_of_a_file_into_a_folder_of_its_own(files, ca
     [
         (("--as", "spark"), "no effect without --file"),
         (("--file", "x.txt"), "a name that ends in"),
-        (("--file", "x.sog"), "cannot be opened"),
+        (("--file", "x.sog"), "cannot be read"),
         (("--file", "point_cloud.ply", "--as", "nobody"), "there is no viewer named 'nobody'"),
     ],
 )

@@ -92,19 +92,19 @@ def representable(cloud: SplatCloud) -> NDArray[np.bool_]:
     return valid
 
 
-def bytes_of(path: Path) -> bytes:
-    """Return the content of a file of Gaussians.
+def bytes_of(path: Path, most: int = -1) -> bytes:
+    """Return the first `most` bytes of a file of Gaussians, or all bytes.
 
     Raises:
-        UserError: The file cannot be opened.
+        UserError: The file cannot be read.
     """
     try:
         with open_file(path) as file:
-            return file.read()
+            return file.read(most)
     except OSError as error:
         raise UserError(
-            "the file of Gaussians cannot be opened",
+            "the file of Gaussians cannot be read",
             where=path,
             found=error.strerror or str(error),
-            todo="check the path",
+            todo="check the path and the permissions of the file",
         ) from error

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.numerics.raster_constants import COEFFICIENTS
 from crossgrad_core.plugin import Gaussians, Similarity, UserError
-from crossgrad_plugins.exporters.file_units import representable
+from crossgrad_plugins.exporters.file_units import bytes_of, representable
 from crossgrad_plugins.exporters.glb_file import (
     BIN,
     CHUNK_HEADER,
@@ -26,7 +26,7 @@ from crossgrad_plugins.exporters.glb_file import (
     attribute_names,
 )
 from crossgrad_plugins.exporters.ply_cloud import REST, SplatCloud
-from crossgrad_plugins.exporters.spz_file import SpzTable, content_of
+from crossgrad_plugins.exporters.spz_file import SpzTable
 
 #: Largest share by which the axes of a node may differ from a rotation with one scale.
 _UNEVEN: Final = 1e-4
@@ -111,7 +111,7 @@ def degree_of(path: Path) -> int:
 
 
 def _opened(path: Path) -> _Glb:
-    raw = content_of(path)
+    raw = bytes_of(path)
     start = HEADER.size
     chunks: dict[bytes, bytes] = {}
     if raw[:4] != GLB:

@@ -16,9 +16,9 @@ from crossgrad_core.plugin import (
     Similarity,
     atomic_file,
 )
-from crossgrad_plugins.exporters.file_units import FileCloud
+from crossgrad_plugins.exporters.file_units import FileCloud, bytes_of
 from crossgrad_plugins.exporters.ply_cloud import SplatCloud
-from crossgrad_plugins.exporters.spz_file import SpzTable, content_of, spz_degree
+from crossgrad_plugins.exporters.spz_file import SpzTable, spz_degree
 
 
 class Spz(Exporter):
@@ -54,7 +54,7 @@ class Spz(Exporter):
 
     @override
     def read(self, path: Path, similarity: Similarity) -> Gaussians:
-        table = SpzTable.unpacked(content_of(path), path)
+        table = SpzTable.unpacked(bytes_of(path), path)
         return table.to_cloud().to_local(similarity).to_gaussians()
 
     @override

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.numerics.raster_constants import COEFFICIENTS
-from crossgrad_core.plugin import UserError, open_file
+from crossgrad_core.plugin import UserError
+from crossgrad_plugins.exporters.file_units import bytes_of
 from crossgrad_plugins.exporters.ply_cloud import REST, SplatCloud
 
 Bytes = NDArray[np.uint8]
@@ -186,30 +187,12 @@ def spz_degree(path: Path) -> int:
     Raises:
         UserError: The file cannot be read, or is not an SPZ file of version 2 or 3.
     """
-    start = content_of(path, 4096)
+    start = bytes_of(path, 4096)
     try:
         head = zlib.decompressobj(16 + zlib.MAX_WBITS).decompress(start, _HEADER.size)
     except zlib.error as error:
         raise _damaged(path, str(error)) from error
     return int(_header(head, path)[3])
-
-
-def content_of(path: Path, most: int = -1) -> bytes:
-    """Return the first `most` bytes of a file of Gaussians, or all bytes.
-
-    Raises:
-        UserError: The file cannot be read.
-    """
-    try:
-        with open_file(path) as file:
-            return file.read(most)
-    except OSError as error:
-        raise UserError(
-            "the file of Gaussians cannot be read",
-            where=path,
-            found=error.strerror or str(error),
-            todo="check the path and the permissions of the file",
-        ) from error
 
 
 def _header(head: bytes, where: Path) -> tuple[Any, ...]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.commands import (
     RasterizerDemands,
+    check_frame,
     choose_rasterizer,
     configured,
     evaluated_model,
@@ -56,6 +57,9 @@ def stage_of(paths: Sequence[Path], how: How) -> Stage:
         UserError: A path is nothing of these, or cannot be read.
     """
     opened = [_opened(path, how) for path in paths]
+    if any(scene is not None for _, scene in opened):
+        for path in filter(Path.is_file, paths):
+            check_frame(path)
     sources = [source for source, _ in opened]
     scene = next((scene for _, scene in opened if scene is not None), None)
     world = sources[0].similarity if scene is None else scene.similarity

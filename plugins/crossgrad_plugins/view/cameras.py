@@ -20,8 +20,6 @@ _SIDES: Final = (16, 16_384)
 #: Two poses are equal up to the rounding of the browser: difference of the rotation's entries, and
 #: distance in local units.
 _SAME_ROTATION, _SAME_PLACE = 1e-3, 1e-3
-#: Smallest share of the second direction in the horizontal axes of cameras that span a plane.
-_SPAN: Final = 0.05
 #: Length of a drawn camera, as a share of the distance to the next camera and of the scene.
 _OF_NEXT, _OF_SCENE = 0.4, 0.03
 
@@ -128,7 +126,7 @@ def photo_in_window(window: Camera, photo: Camera, share: float = 1.0) -> Fit:
 
 
 def fov_in_window(window: Camera, photo: Camera) -> float:
-    """Return the vertical field of view at which a window shows a photo as a whole, radians."""
+    """Return the vertical field of view, in radians, at which the window shows the whole photo."""
     fit = photo_in_window(window, photo)
     return 2 * atan(fit.height / 2 / fit.camera.fy)
 
@@ -139,27 +137,6 @@ def free_camera() -> Camera:
     pose[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
     pose[2, 3] = 3.0
     return Camera(1280, 720, 900.0, 900.0, 640.0, 360.0, torch.from_numpy(pose))
-
-
-def up_of(views: Sequence[View]) -> _Floats:
-    """Return the upward direction of a scene, a unit vector; z without cameras.
-
-    Cameras are rarely rolled, so that their horizontal axes span the ground plane. If all cameras
-    look the same way, the mean of their upward axes is used.
-    """
-    if not views:
-        return np.array([0.0, 0.0, 1.0])
-    across, down, ahead = np.stack([v.camera.world_to_camera[:3, :3].numpy() for v in views], 1)
-    values, vectors = np.linalg.eigh(across.T @ across / len(views))
-    if values[1] < _SPAN:
-        return _unit(-down.mean(axis=0), np.array([0.0, 0.0, 1.0]))
-    # A camera looks level, or down on the scene.
-    return np.asarray(vectors[:, 0] * (1.0 if vectors[:, 0] @ -(down + ahead).sum(0) > 0 else -1.0))
-
-
-def _unit(vector: _Floats, otherwise: _Floats) -> _Floats:
-    length = float(np.linalg.norm(vector))
-    return np.asarray(vector / length) if length > 0 else otherwise
 
 
 def distance_ahead(view: View, points: _Floats, otherwise: float) -> float:

@@ -11,7 +11,6 @@ from time import monotonic
 from typing import Any, Final
 
 from crossgrad_core.plugin import UserError
-from crossgrad_plugins.view.cameras import up_of
 from crossgrad_plugins.view.session import STILL_AFTER, Session, Stage
 
 #: Address that only this machine reaches, and the usual port of viewers.
@@ -100,7 +99,8 @@ class Viewer:
         # A public address would need a server of others.
         self._server.request_share_url = lambda verbose=True: None  # noqa: ARG005
         self._server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
-        self._server.scene.set_up_direction(tuple(up_of(stage.views)))
+        up = (0.0, 0.0, 1.0) if stage.scene is None else tuple(stage.scene.up)
+        self._server.scene.set_up_direction(up)
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(self._disconnected)
 

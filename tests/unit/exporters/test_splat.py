@@ -71,7 +71,7 @@ def test_a_damaged_splat_is_refused(content, tmp_path):
     (tmp_path / "a.splat").write_bytes(content)
     with pytest.raises(UserError, match="splat file cannot be read"):
         Splat().read(tmp_path / "a.splat", HERE)
-    with pytest.raises(UserError, match="cannot be opened"):
+    with pytest.raises(UserError, match="cannot be read"):
         Splat().sh_degree_of(tmp_path / "b.splat")
 
 

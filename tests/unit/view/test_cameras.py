@@ -19,7 +19,6 @@ from crossgrad_plugins.view.cameras import (
     moved,
     photo_in_window,
     quaternion_of,
-    up_of,
     whole_window,
 )
 from crossgrad_plugins.view.training import Training
@@ -71,14 +70,6 @@ def test_a_large_window_gets_fewer_pixels():
     fit = whole_window(replace(free_camera(), width=8000, height=4000), 1.0)
     assert fit.width * fit.height <= MOST_PIXELS * 1.01
     assert isclose(fit.width / fit.height, 2.0, rel_tol=0.01)
-
-
-def test_the_upward_direction_is_found_from_cameras_that_look_down_and_level():
-    turned = [[0, 1, 0], [1, 0, 0], [0, 0, -1]]
-    for rows in ([DOWN, turned], [LEVEL, DOWN], [LEVEL, LEVEL]):
-        found = up_of([view(camera(each)) for each in rows])
-        np.testing.assert_allclose(found, [0.0, 0.0, 1.0], atol=1e-9)
-    np.testing.assert_array_equal(up_of([]), [0.0, 0.0, 1.0])
 
 
 def test_a_camera_moves_between_the_frames_of_two_runs():
